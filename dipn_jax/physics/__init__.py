@@ -1,0 +1,75 @@
+"""One interface, two engines: `native` (MuJoCo C on CPU threads) and `mjx` (XLA: GPU, TPU, CPU).
+
+Both read the same MJCF (`dipn_jax.model`), take the same arguments and return the same result, so which
+one runs is a configuration value.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol
+
+import jax
+
+from dipn_jax.errors import UserError
+from dipn_jax.model import PhysicsConfig
+from dipn_jax.structs import Array, Rollout, Scene, Trajectory
+
+EngineName = Literal["auto", "native", "mjx"]
+
+CONTROL_PERIOD = 0.01
+"""Seconds between set points; faults are looked for as often."""
+MAX_SPEED = 5.0
+"""m/s; a drop from 0.6 m ends at 3.4 m/s."""
+REST_SPEED = 0.02
+"""m/s (and, times the size of an object, the bound on rotation) below which a scene is at rest."""
+MAX_SINK = 0.004
+"""Metres that the lowest corner of an object may be under the table."""
+MAX_SHORT = 0.01
+"""Metres by which a gripper may miss its last set point."""
+
+
+class Engine(Protocol):
+    """Simulates a batch of independent scenes."""
+
+    name: str
+    config: PhysicsConfig
+
+    def simulate(
+        self, scenes: Scene, poses: Array, trajectories: Trajectory, samples: Array, *, settle: bool = False
+    ) -> Rollout:
+        """Follow `trajectories` from rest.
+
+        Args:
+          scenes: `[B, N, ...]`.
+          poses: `[B, N, 7]` initial poses; velocities are zero.
+          trajectories: `time [B, K]`, `target [B, K, 5]`; the gripper starts at the first key frame.
+          samples: `[S]` seconds, increasing, common to the batch; the simulation ends at the last.
+          settle: flag episodes in which something still moves at the end.
+
+        Returns:
+          Rollout with a leading `[B]`; what went wrong is in `fault [B]`.
+        """
+        ...
+
+
+def make_engine(name: EngineName, config: PhysicsConfig | None = None) -> Engine:
+    """The engine called `name`; `auto` is `native` on a CPU and `mjx` on an accelerator.
+
+    Args:
+      name: engine.
+      config: solver settings; each engine's own defaults if not given.
+
+    Raises:
+      UserError: no such engine.
+    """
+    if name == "auto":
+        name = "native" if jax.default_backend() == "cpu" else "mjx"
+    if name == "native":
+        from dipn_jax.physics import native
+
+        return native.NativeEngine(config or native.DEFAULTS)
+    if name == "mjx":
+        from dipn_jax.physics import mjx
+
+        return mjx.MjxEngine(config or mjx.DEFAULTS)
+    raise UserError(f"engine {name!r}: want auto, native or mjx")

@@ -1,0 +1,204 @@
+"""Where scenes come from: a key (random clutter in mid-air) or a case file (hand-placed)."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import geometry, shapes
+from dipn_jax.errors import UserError
+from dipn_jax.structs import ABSENT, Scene
+from dipn_jax.workspace import WORKSPACE
+
+PAPER_COUNTS = (0.02, 0.05, 0.2, 0.35, 0.3, 0.05, 0.03)
+"""P(1..7 objects) of the push data. Source: DIPN's released code."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneConfig:
+    """What random scenes are made of."""
+
+    slots: int = 7  # padded number of objects
+    counts: tuple[float, ...] = PAPER_COUNTS  # probability of 1, 2, ... objects
+    items: tuple[str, ...] = ()  # names from shapes.CATALOGUE; empty: all of them
+    scale: tuple[float, float] = (0.9, 1.03)  # of each nominal dimension
+    density: tuple[float, float] = (250.0, 750.0)  # kg/m^3
+    friction: tuple[float, float] = (0.28, 0.42)  # object-table
+    spread: float = 0.24  # metres: side of the square the objects' centres are dropped in
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.counts) <= self.slots:
+            raise UserError(
+                f"scene config: {len(self.counts)} object counts for {self.slots} slots; want 1 to {self.slots}"
+            )
+        if min(self.counts) < 0 or sum(self.counts) <= 0:
+            raise UserError(f"scene config: counts {self.counts} are not probabilities; want non-negative, sum > 0")
+        names = {item.name for item in shapes.CATALOGUE}
+        unknown = [name for name in self.items if name not in names]
+        if unknown:
+            raise UserError(f"scene config: unknown items {unknown}; choose from {sorted(names)}")
+
+
+def fixed_count(count: int, **changes: Any) -> SceneConfig:
+    """A config with exactly `count` objects."""
+    return SceneConfig(slots=count, counts=(0.0,) * (count - 1) + (1.0,), **changes)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Array]:
+    """Random objects in mid-air, none touching another.
+
+    Args:
+      key: random key.
+      config: distributions.
+
+    Returns:
+      The scene, and poses `[N, 7]`: random positions and orientations, each object just above the
+      bounding spheres of those before it. Empty slots are parked outside the workspace.
+    """
+    n = config.slots
+    keys = jax.random.split(key, 9)
+    items = [i for i in shapes.CATALOGUE if not config.items or i.name in config.items]
+    classes = jnp.array([shapes.CLASSES.index(i.shape) for i in items])
+    nominal = jnp.array([i.size_mm for i in items], jnp.float32) / 1000
+    count = 1 + jax.random.categorical(keys[0], jnp.log(jnp.array(config.counts)))
+    present = jnp.arange(n) < count
+    item = jax.random.randint(keys[1], (n,), 0, len(items))
+    shape = jnp.where(present, classes[item], ABSENT)
+    size = nominal[item] * jax.random.uniform(keys[2], (n, 3), minval=config.scale[0], maxval=config.scale[1])
+    diagonal = jnp.linalg.norm(size, axis=-1, keepdims=True)
+    size = size * jnp.minimum(1.0, shapes.MAX_DIAGONAL / diagonal)
+    colors = jnp.array(shapes.COLORS_RGB, jnp.float32) / 255
+    palette = jax.random.permutation(keys[3], len(colors))
+    color = colors[palette[jnp.arange(n) % len(colors)]]
+    density = jax.random.uniform(keys[4], (n,), minval=config.density[0], maxval=config.density[1])
+    mass = density * jnp.asarray(shapes.UNIT_VOLUME, jnp.float32)[classes[item]] * size.prod(-1)
+    friction = jax.random.uniform(keys[5], (n,), minval=config.friction[0], maxval=config.friction[1])
+    xy = jax.random.uniform(keys[6], (n, 2), minval=-0.5, maxval=0.5) * config.spread
+    quat = geometry.random_quat(keys[7], (n,))
+    radius = shapes.radius(shape, size)
+    z = _stack_heights(xy, radius, present)
+    poses = jnp.concatenate([xy, z[:, None], quat], -1)
+    poses = jnp.where(present[:, None], poses, parked(n))
+    return Scene(shape.astype(jnp.int32), size, color, mass, friction), poses
+
+
+def _stack_heights(xy: jax.Array, radius: jax.Array, present: jax.Array) -> jax.Array:
+    """Lowest heights `[N]` at which spheres of `radius [N]` over `xy [N, 2]` do not overlap, placed in order."""
+
+    def place(heights: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
+        gap = (xy - xy[i]) ** 2
+        reach = (radius + radius[i] + 0.002) ** 2 - gap.sum(-1)
+        before = (jnp.arange(len(radius)) < i) & present & (reach > 0)
+        above = jnp.where(before, heights + jnp.sqrt(jnp.maximum(reach, 0.0)), 0.0)
+        return heights.at[i].set(jnp.maximum(radius[i] + 0.005, above.max())), None
+
+    heights, _ = jax.lax.scan(place, jnp.zeros_like(radius), jnp.arange(len(radius)))
+    return heights
+
+
+def parked(n: int) -> jax.Array:
+    """Poses `[N, 7]` of empty slots: far outside the workspace, apart from one another."""
+    x = 5.0 + 0.5 * jnp.arange(n, dtype=jnp.float32)
+    zero, one = jnp.zeros(n), jnp.ones(n)
+    return jnp.stack([x, zero + 5.0, zero + 1.0, one, zero, zero, zero], -1)
+
+
+def remove(scene: Scene, poses: jax.Array, gone: jax.Array) -> tuple[Scene, jax.Array]:
+    """The scene without the objects `gone [N]`."""
+    shape = jnp.where(gone, ABSENT, scene.shape)
+    return scene.replace(shape=shape), jnp.where(gone[:, None], parked(len(gone)), poses)
+
+
+def hard_cases_path() -> pathlib.Path:
+    """The ten hard instances that come with the package."""
+    return pathlib.Path(__file__).parent / "data" / "hard_cases.json"
+
+
+def load_cases(path: pathlib.Path, *, slots: int | None = None) -> tuple[list[str], Scene, np.ndarray]:
+    """Read a case file (the format of `hard_cases.json`).
+
+    Args:
+      path: JSON file with `cases`, each a name and a list of objects.
+      slots: padded number of objects; the largest case's by default.
+
+    Returns:
+      Names, scenes `[C, N, ...]` and poses `[C, N, 7]` as placed: not settled. Density 500 kg/m^3, friction 0.35.
+
+    Raises:
+      UserError: the file is missing, is not JSON, or an object in it has an unknown shape or a wrong size.
+    """
+    try:
+        cases = json.loads(path.read_text())["cases"]
+    except FileNotFoundError:
+        raise UserError(f"case file {path}: not found; give a JSON file in the format of {hard_cases_path().name}") from None
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise UserError(f"case file {path}: not a JSON object with a list `cases` ({error!r})") from None
+    if not cases:
+        raise UserError(f"case file {path}: `cases` is empty; want at least one case with at least one object")
+    most = max(len(case.get("objects", [])) for case in cases)
+    n = slots or most
+    if most > n:
+        raise UserError(f"case file {path}: a case has {most} objects, but there are {n} slots")
+    loaded = [_case(case, n, path) for case in cases]
+    scene = jax.tree.map(lambda *leaves: np.stack(leaves), *[scene for scene, _ in loaded])
+    return [str(case.get("name", i)) for i, case in enumerate(cases)], scene, np.stack([p for _, p in loaded])
+
+
+def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, np.ndarray]:
+    objects = case.get("objects", [])
+    where = f"case file {path}, case {case.get('name', '?')}"
+    if not objects:
+        raise UserError(f"{where}: no objects; want at least one")
+    shape = np.full(n, ABSENT, np.int32)
+    size = np.full((n, 3), 0.05, np.float32)
+    color = np.zeros((n, 3), np.float32)
+    poses = np.array(parked(n))
+    for i, entry in enumerate(objects):
+        name = entry.get("shape")
+        if name not in shapes.CLASSES:
+            raise UserError(f"{where}, object {i}: unknown shape {name!r}; want one of {', '.join(shapes.CLASSES)}")
+        try:
+            size[i] = _numbers(entry["size_mm"], 3) / 1000
+            position = _numbers(entry["position_m"], 2)
+            quat = _numbers(entry["quaternion_wxyz"], 4)
+            color[i] = _numbers(entry.get("color_rgb", shapes.COLORS_RGB[i % 10]), 3) / 255
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"{where}, object {i}: {error!r}; want size_mm [3], position_m [2], quaternion_wxyz [4]"
+            ) from None
+        if size[i].min() < 0.005 or np.linalg.norm(size[i]) > shapes.MAX_DIAGONAL:
+            raise UserError(
+                f"{where}, object {i}: size_mm {entry['size_mm']}; want 5 mm or more a side and a diagonal of at most "
+                f"{1000 * shapes.MAX_DIAGONAL:.0f} mm"
+            )
+        if np.abs(position).max() > WORKSPACE.half or np.linalg.norm(quat) < 1e-6:
+            raise UserError(
+                f"{where}, object {i}: position_m {entry['position_m']} or quaternion_wxyz is out of range; want "
+                f"|x|, |y| <= {WORKSPACE.half} and a non-zero quaternion"
+            )
+        shape[i] = shapes.CLASSES.index(name)
+        quat = quat / np.linalg.norm(quat)
+        height = entry.get("height_m")
+        rotation = np.asarray(geometry.quat_to_matrix(jnp.asarray(quat)))
+        corners = shapes.UNIT_VERTICES[shape[i]][shapes.CORNERS_USED[shape[i]] > 0].reshape(-1, 3) * size[i]
+        center = rotation @ (shapes.UNIT_CENTER_OF_MASS[shape[i]] * size[i])  # from the middle of the box
+        resting = 0.0005 - float((corners @ rotation[2]).min())
+        z = resting if height is None else float(height) + center[2]
+        poses[i] = np.concatenate([position + center[:2], [z], quat])
+    mass = np.where(shape >= 0, 500.0 * shapes.volume(shape, size), 0.1).astype(np.float32)
+    return Scene(shape, size, color, mass, np.full(n, 0.35, np.float32)), poses
+
+
+def _numbers(values: Any, length: int) -> np.ndarray:
+    array = np.asarray(values, np.float32)
+    if array.shape != (length,) or not np.isfinite(array).all():
+        raise ValueError(f"{values} is not {length} finite numbers")
+    return array

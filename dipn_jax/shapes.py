@@ -1,0 +1,218 @@
+"""The catalogue: every object as one or more convex prisms.
+
+A class is defined once, in a unit cube, as up to `PARTS` convex polygons extruded along one axis; an
+object is its class stretched to its bounding box. An object's frame is at its centre of mass, along the
+axes of the box. Everything downstream (MuJoCo model,
+collision hulls, renderer) reads the same vertices, so sizes and even classes can be traced values.
+
+Round shapes are regular prisms: MJX has no collision between a cylinder and a mesh, and twelve
+corners still roll where friction is above tan(15 deg) = 0.27.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax.structs import Pytree
+
+CLASSES = ("cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave")
+CORNERS = 12
+PARTS = 3
+
+Polygon = list[tuple[float, float]]
+
+
+def _arc(start: float, stop: float, count: int) -> np.ndarray:
+    angle = np.deg2rad(np.linspace(start, stop, count))
+    return np.stack([np.cos(angle), np.sin(angle)], -1) / 2
+
+
+def _half_disc() -> Polygon:
+    """Flat face down, bounding box [-1/2, 1/2]^2, as (x, z) turned to (z, x) for an extrusion along y."""
+    xz = _arc(0, 180, CORNERS - 1) * np.array([1.0, 2.0]) - np.array([0.0, 0.5])
+    return [(z, x) for x, z in xz[::-1]]  # mirrored by the swap, hence reversed: counter-clockwise again
+
+
+def _notched() -> list[Polygon]:
+    """The arch in (z, x): a 26 mm half-round notch in a 100 x 50 mm face, as a trapezoid of equal area and depth."""
+    rim, floor, depth = 0.26, 0.148, 0.02  # of 100 mm, of 100 mm, and x = -1 mm of 50 mm
+    left = [(-0.5, -0.5), (-floor, -0.5), (-floor, -depth), (-rim, 0.5), (-0.5, 0.5)]
+    right = [(-u, v) for u, v in reversed(left)]
+    middle = [(-floor, -0.5), (floor, -0.5), (floor, -depth), (-floor, -depth)]
+    return [left, right, middle]
+
+
+_SQUARE: Polygon = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
+_DISC: Polygon = [(float(u), float(v)) for u, v in _arc(15, 345, CORNERS) / np.cos(np.pi / 12)]
+
+# class -> extrusion axis and polygons in the two axes that follow it cyclically (z -> x, y; y -> z, x)
+_SECTIONS: dict[str, tuple[int, list[Polygon]]] = {
+    "cuboid": (2, [_SQUARE]),
+    "cylinder": (1, [_DISC]),
+    "half_cylinder": (1, [_half_disc()]),
+    "triangular_prism": (2, [[(0.0, -0.5), (0.5, 0.5), (-0.5, 0.5)]]),
+    "concave": (1, _notched()),
+}
+
+
+def _rings() -> tuple[np.ndarray, np.ndarray]:
+    """Unit vertices [C, P, 2K, 3] and the number of distinct corners [C, P] (0: no such part)."""
+    vertices = np.zeros((len(CLASSES), PARTS, 2 * CORNERS, 3))
+    used = np.zeros((len(CLASSES), PARTS), np.int32)
+    for c, name in enumerate(CLASSES):
+        axis, polygons = _SECTIONS[name]
+        for p, polygon in enumerate(polygons):
+            used[c, p] = len(polygon)
+            ring = np.array(polygon + [polygon[-1]] * (CORNERS - len(polygon)))
+            for side, at in enumerate((-0.5, 0.5)):
+                block = vertices[c, p, side * CORNERS : (side + 1) * CORNERS]
+                block[:, (axis + 1) % 3], block[:, (axis + 2) % 3], block[:, axis] = ring[:, 0], ring[:, 1], at
+    return vertices, used
+
+
+def _moments() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Volume [C], centre of mass [C, 3] and variance about it [C, 3] of the unit shapes."""
+    volume = np.zeros(len(CLASSES))
+    mean = np.zeros((len(CLASSES), 3))
+    variance = np.zeros((len(CLASSES), 3))
+    for c, name in enumerate(CLASSES):
+        axis, polygons = _SECTIONS[name]
+        first, second, area = np.zeros(2), np.zeros(2), 0.0
+        for polygon in polygons:
+            a = np.array(polygon)
+            b = np.roll(a, -1, axis=0)
+            cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+            area += cross.sum() / 2
+            first += (cross[:, None] * (a + b)).sum(0) / 6
+            second += (cross[:, None] * (a * a + a * b + b * b)).sum(0) / 12
+        section = [(axis + 1) % 3, (axis + 2) % 3]
+        volume[c] = area
+        mean[c, section] = first / area
+        variance[c, section] = second / area - (first / area) ** 2
+        variance[c, axis] = 1 / 12
+    return volume, mean, variance
+
+
+UNIT_VOLUME, UNIT_CENTER_OF_MASS, UNIT_VARIANCE = _moments()
+"""Volume [C], centre of mass [C, 3] from the middle of the bounding box, variance about it [C, 3]."""
+_RINGS, CORNERS_USED = _rings()
+UNIT_VERTICES = _RINGS - UNIT_CENTER_OF_MASS[:, None, None] * (CORNERS_USED > 0)[..., None, None]
+"""[C, P, 2K, 3]: corners from the centre of mass."""
+AXIS = np.array([_SECTIONS[name][0] for name in CLASSES], np.int32)
+"""Extrusion axis of each class: 0, 1, 2 for x, y, z."""
+
+
+def _sides() -> np.ndarray:
+    """For each ring edge [C, P, K] the first ring edge with the same plane: itself, or 0 for a repeated corner."""
+    side = np.tile(np.arange(CORNERS), (len(CLASSES), PARTS, 1))
+    repeated = (side >= CORNERS_USED[..., None] - 1) & (side < CORNERS - 1)
+    return np.where(repeated, 0, side)
+
+
+SIDES = _sides()
+
+
+@dataclasses.dataclass(frozen=True)
+class Item:
+    """A named object of the catalogue: its class and nominal bounding box in millimetres."""
+
+    name: str
+    shape: str
+    size_mm: tuple[float, float, float]
+
+
+# Source: DIPN's released code, evaluation objects first, then its further training objects.
+CATALOGUE = (
+    Item("triangle", "triangular_prism", (100, 50, 50)),
+    Item("concave", "concave", (50, 50, 100)),
+    Item("cuboid_half", "cuboid", (50, 50, 25)),
+    Item("cuboid_flat", "cuboid", (100, 50, 25)),
+    Item("cuboid_long", "cuboid", (100, 50, 50)),
+    Item("cube", "cuboid", (50, 50, 50)),
+    Item("half_cylinder", "half_cylinder", (50, 40, 25)),
+    Item("cylinder", "cylinder", (48, 50, 48)),
+    Item("cylinder_flat", "cylinder", (66, 28, 56)),
+    Item("half_cylinder_large", "half_cylinder", (83, 49, 30)),
+    Item("concave_slim", "concave", (31, 28, 75)),
+    Item("cuboid_mid", "cuboid", (67, 45, 30)),
+    Item("cuboid_square", "cuboid", (70, 70, 25)),
+    Item("triangle_flat", "triangular_prism", (66, 56, 30)),
+)
+
+# Source: DIPN's released code.
+COLORS_RGB = (
+    (78, 121, 167),
+    (89, 161, 79),
+    (156, 117, 95),
+    (242, 142, 43),
+    (237, 201, 72),
+    (186, 176, 172),
+    (255, 87, 89),
+    (176, 122, 161),
+    (118, 183, 178),
+    (255, 157, 167),
+)
+
+MAX_DIAGONAL = 0.126
+"""Metres: no bounding box is longer, so that an object fits a 64 pixel window however it lies."""
+
+
+@flax.struct.dataclass
+class Hull(Pytree):
+    """The convex parts of one object, in the object's own frame."""
+
+    vertices: jax.Array  # [P, 2K, 3] metres: lower ring, upper ring, counter-clockwise about the axis
+    normals: jax.Array  # [P, K + 2, 3] outward unit normals: sides, lower cap, upper cap
+    offsets: jax.Array  # [P, K + 2] metres: a point x is inside where normals @ x <= offsets
+    alive: jax.Array  # [P] bool
+
+
+def hull(shape: jax.Array, size: jax.Array) -> Hull:
+    """The parts of an object.
+
+    Args:
+      shape: `[]` int, index into CLASSES; a negative one gives no part.
+      size: `[3]` metres, bounding box.
+    """
+    index = jnp.maximum(shape, 0)
+    vertices = jnp.asarray(UNIT_VERTICES, jnp.float32)[index] * size
+    axis = jnp.asarray(np.eye(3)[AXIS], jnp.float32)[index]
+    ring = vertices[:, :CORNERS]
+    edge = jnp.roll(ring, -1, axis=1) - ring
+    normal = jnp.cross(edge, axis)
+    length = jnp.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = normal / jnp.where(length > 0, length, 1.0)
+    sides = jnp.asarray(SIDES)[index]
+    normal = jnp.take_along_axis(normal, sides[..., None], axis=1)
+    corner = jnp.take_along_axis(ring, sides[..., None], axis=1)
+    caps = jnp.broadcast_to(jnp.stack([-axis, axis]), (PARTS, 2, 3))
+    cap_corner = jnp.stack([vertices[:, 0], vertices[:, CORNERS]], axis=1)
+    normals = jnp.concatenate([normal, caps], axis=1)
+    offsets = (normals * jnp.concatenate([corner, cap_corner], axis=1)).sum(-1)
+    alive = (jnp.asarray(CORNERS_USED)[index] > 0) & (shape >= 0)
+    return Hull(vertices, normals, offsets, alive)
+
+
+def volume(shape: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Volume `[...]` in cubic metres of shapes `[...]` with bounding boxes `[..., 3]`."""
+    return UNIT_VOLUME[np.maximum(shape, 0)] * np.prod(size, axis=-1)
+
+
+def inertia(shape: jax.Array, size: jax.Array, mass: jax.Array) -> jax.Array:
+    """Diagonal inertia `[3]` (kg m^2) about the centre of mass.
+
+    Every class has two planes of symmetry, so its inertia is diagonal in its own axes.
+    """
+    spread = jnp.asarray(UNIT_VARIANCE, jnp.float32)[jnp.maximum(shape, 0)] * size**2
+    return mass * (spread.sum() - spread)
+
+
+def radius(shape: jax.Array, size: jax.Array) -> jax.Array:
+    """Radius `[...]` (metres) of a ball about the centre of mass that holds the object."""
+    offset = jnp.asarray(UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(shape, 0)] * size
+    return jnp.linalg.norm(size, axis=-1) / 2 + jnp.linalg.norm(offset, axis=-1)

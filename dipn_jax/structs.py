@@ -1,0 +1,172 @@
+"""The types that cross the rooms of the project.
+
+Every field states its shape, unit and frame *without* the batch axis; a leading `[B]` is added by
+`jax.vmap` or by the caller. `N` is the padded number of object slots, `P` a number of pushes, `S` a
+number of sampled instants.
+
+Workspace frame: origin at the centre of the workspace on the table's surface, z up, angles from +x
+toward +y. Maps are indexed `[row, col]`, row along +y and col along +x.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import numpy as np
+
+Array = jax.Array | np.ndarray
+
+ABSENT = -1
+"""Value of `Scene.shape` in an empty slot."""
+
+
+class Fault:
+    """Bits of a fault code: failure inside a simulation is data, not an exception."""
+
+    NON_FINITE = 1  # a position or velocity became inf or NaN
+    CAPACITY = 2  # the engine ran out of room for contacts or geom pairs
+    UNSETTLED = 4  # something still moved when it had to be at rest
+    OUTSIDE = 8  # an object's centre is outside the workspace
+    SPEED = 16  # an object moved faster than anything dropped or pushed should
+    PENETRATION = 32  # an object sank into the table
+    SHORT = 64  # the gripper did not reach its commanded pose
+
+    NAMES = {
+        1: "non_finite",
+        2: "capacity",
+        4: "unsettled",
+        8: "outside",
+        16: "speed",
+        32: "penetration",
+        64: "gripper_short",
+    }
+
+    @classmethod
+    def count(cls, codes: Array) -> dict[str, int]:
+        """How many of `codes [B]` carry each named fault."""
+        flat = np.asarray(codes).reshape(-1)
+        return {name: int(((flat & bit) != 0).sum()) for bit, name in cls.NAMES.items()}
+
+
+class Pytree:
+    """What `flax.struct.dataclass` adds, for the type checker."""
+
+    def replace(self, **changes: Any) -> Any:
+        """A copy with some fields replaced."""
+        raise NotImplementedError
+
+
+@flax.struct.dataclass
+class Scene(Pytree):
+    """What lies on the table, apart from where it lies."""
+
+    shape: Array  # [N] int32: index into shapes.CLASSES, ABSENT where the slot is empty
+    size: Array  # [N, 3] metres: bounding box along the object's own axes
+    color: Array  # [N, 3] in [0, 1]: RGB
+    mass: Array  # [N] kg
+    friction: Array  # [N] sliding coefficient between the object and the table
+
+
+@flax.struct.dataclass
+class Observation(Pytree):
+    """What the camera sees, orthographic, straight down."""
+
+    height: Array  # [H, W] metres above the table
+    color: Array  # [H, W, 3] in [0, 1]
+    label: Array  # [H, W] int32: object slot, ABSENT on the table
+
+
+@flax.struct.dataclass
+class Push(Pytree):
+    """A straight horizontal sweep with the closed gripper."""
+
+    start: Array  # [2] metres, workspace: where the gripper comes down
+    angle: Array  # [] radians: direction of travel
+    distance: Array  # [] metres
+
+
+@flax.struct.dataclass
+class Grasp(Pytree):
+    """A top-down grasp."""
+
+    center: Array  # [2] metres, workspace: midpoint between the fingers
+    angle: Array  # [] radians: direction of the closing axis
+    height: Array  # [] metres: fingertips above the table
+
+
+@flax.struct.dataclass
+class Trajectory(Pytree):
+    """Gripper set points, linear between `K` key frames."""
+
+    time: Array  # [K] seconds, increasing
+    target: Array  # [K, 5]: x, y, tip height (metres), yaw of the closing axis (radians), inner gap (metres)
+
+
+@flax.struct.dataclass
+class Rollout(Pytree):
+    """What a simulation returns."""
+
+    poses: Array  # [S, N, 7]: position (metres) and quaternion wxyz, workspace
+    gripper: Array  # [S, 5]: as Trajectory.target, as reached
+    fault: Array  # [] int32: bits of Fault
+
+
+@flax.struct.dataclass
+class Outcome(Pytree):
+    """Result of a grasp."""
+
+    held: Array  # [N] bool: objects in the hand after the lift
+    success: Array  # [] bool: at least one
+
+
+@flax.struct.dataclass
+class PushEpisode(Pytree):
+    """One push: everything needed to render it, before, during and after."""
+
+    scene: Scene
+    poses: Array  # [11, N, 7]: at 0, 1, ..., 10 cm of travel
+    after: Array  # [N, 7]: at rest, the gripper gone
+    push: Push
+    fault: Array  # [] int32
+
+
+@flax.struct.dataclass
+class GraspEpisode(Pytree):
+    """One grasp and whether it held."""
+
+    scene: Scene
+    poses: Array  # [N, 7] before
+    after: Array  # [N, 7] after the lift
+    grasp: Grasp
+    held: Array  # [N] bool
+    success: Array  # [] bool
+    fault: Array  # [] int32
+
+
+@flax.struct.dataclass
+class SettledScene(Pytree):
+    """A scene at rest; the data set of images is made of these."""
+
+    scene: Scene
+    poses: Array  # [N, 7]
+    fault: Array  # [] int32
+
+
+@flax.struct.dataclass
+class Decision(Pytree):
+    """What the planner chose."""
+
+    is_push: Array  # [] bool
+    push: Push
+    grasp_pixel: Array  # [3] int32: rotation, row, col of the best grasp
+    grasp_score: Array  # [] score of that grasp in [0, 1]
+    value_now: Array  # [] mean score of all grasps now
+    value_push: Array  # [] gamma times the mean score after the best push; -inf if none is feasible
+    predicted: Array  # [H, W, 4] predicted RGB and height after the best push
+    best: Array  # [] int32 index of the best push among the candidates
+    pushes: Push  # [P] all candidates
+    feasible: Array  # [P] bool
+    values: Array  # [P] gamma times the mean score after each candidate
+    motion: Array  # [N, 3] predicted dx, dy (metres), dtheta (radians) for the best push
