@@ -73,9 +73,7 @@ def _actuators(gripper: Gripper) -> str:
         kp, kv = inertia * g.bandwidth**2, 2 * inertia * g.bandwidth
         rows.append(f'<position joint="{name}" kp="{kp}" kv="{kv}" forcerange="-{force} {force}"/>')
     for name in ("left", "right"):
-        rows.append(
-            f'<position joint="{name}" kp="1000" kv="30" forcerange="-{g.grip_force} {g.grip_force}"/>'
-        )
+        rows.append(f'<position joint="{name}" kp="1000" kv="30" forcerange="-{g.grip_force} {g.grip_force}"/>')
     return "".join(rows)
 
 

@@ -138,7 +138,9 @@ def load_cases(path: pathlib.Path, *, slots: int | None = None) -> tuple[list[st
     try:
         cases = json.loads(path.read_text())["cases"]
     except FileNotFoundError:
-        raise UserError(f"case file {path}: not found; give a JSON file in the format of {hard_cases_path().name}") from None
+        raise UserError(
+            f"case file {path}: not found; give a JSON file in the format of {hard_cases_path().name}"
+        ) from None
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise UserError(f"case file {path}: not a JSON object with a list `cases` ({error!r})") from None
     if not cases:

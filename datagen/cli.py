@@ -1,0 +1,171 @@
+"""`dipn-datagen`: push, grasp, images, verify, repair, info."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import sys
+from typing import Annotated
+
+import tyro
+
+from datagen.generate import Job, generate
+from dipn_jax import console, records, scenes
+from dipn_jax.errors import UserError
+from dipn_jax.physics import EngineName
+
+Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
+
+
+def _scene(objects: str) -> scenes.SceneConfig:
+    if objects == "paper":
+        return scenes.SceneConfig()
+    low, _, high = objects.partition(":")
+    try:
+        first, last = int(low), int(high or low)
+    except ValueError:
+        raise UserError(f"--objects {objects}: want a number, a range like 1:7, or paper") from None
+    if not 1 <= first <= last <= 30:
+        raise UserError(f"--objects {objects}: want 1 to 30, smaller number first")
+    counts = (0.0,) * (first - 1) + (1.0 / (last - first + 1),) * (last - first + 1)
+    return scenes.SceneConfig(slots=last, counts=counts)
+
+
+def push(
+    out: pathlib.Path,
+    episodes: int = 1500,
+    objects: Objects = "paper",
+    seed: int = 0,
+    actions: int = 3,
+    shard_size: int = 500,
+    engine: EngineName = "native",
+    timestep: float = 0.002,
+    shard: int = 0,
+    of: int = 1,
+) -> None:
+    """Push episodes: a settled scene, one 10 cm push, poses at every centimetre.
+
+    1,500 episodes take about two minutes on two cores:
+      dipn-datagen push --out data/push --episodes 1500
+
+    Args:
+      out: folder of the data set; asking again continues or extends it.
+      episodes: how many.
+      objects: number of objects in a scene.
+      seed: seed of everything random.
+      actions: different pushes tried on each settled scene.
+      shard_size: episodes in a file; files are the unit of resuming and of sharing work.
+      engine: native (CPU), mjx (XLA), or auto.
+      timestep: seconds of a physics step (native).
+      shard: this worker's number.
+      of: number of workers; each makes every of-th shard of the same data set.
+    """
+    job = Job("push", _scene(objects), episodes, seed, shard_size, actions, engine, timestep)
+    generate(job, out, part=shard, of=of)
+
+
+def grasp(
+    out: pathlib.Path,
+    episodes: int = 3000,
+    objects: Objects = "10",
+    seed: int = 0,
+    actions: int = 6,
+    shard_size: int = 600,
+    engine: EngineName = "native",
+    timestep: float = 0.002,
+    shard: int = 0,
+    of: int = 1,
+) -> None:
+    """Grasp episodes: a settled scene, one grasp at a random foreground pixel and angle, held or not.
+
+    3,000 episodes take about three minutes on two cores:
+      dipn-datagen grasp --out data/grasp --episodes 3000
+
+    Args:
+      out: folder of the data set; asking again continues or extends it.
+      episodes: how many.
+      objects: number of objects in a scene.
+      seed: seed of everything random.
+      actions: different grasps tried on each settled scene.
+      shard_size: episodes in a file.
+      engine: native (CPU), mjx (XLA), or auto.
+      timestep: seconds of a physics step (native).
+      shard: this worker's number.
+      of: number of workers; each makes every of-th shard of the same data set.
+    """
+    job = Job("grasp", _scene(objects), episodes, seed, shard_size, actions, engine, timestep)
+    generate(job, out, part=shard, of=of)
+
+
+def images(
+    out: pathlib.Path,
+    episodes: int = 100,
+    objects: Objects = "10",
+    seed: int = 0,
+    shard_size: int = 100,
+    engine: EngineName = "native",
+    timestep: float = 0.002,
+    shard: int = 0,
+    of: int = 1,
+) -> None:
+    """Settled scenes without an action, for GN's pre-training on images.
+
+      dipn-datagen images --out data/images --episodes 100
+
+    Args:
+      out: folder of the data set; asking again continues or extends it.
+      episodes: how many scenes.
+      objects: number of objects in a scene.
+      seed: seed of everything random.
+      shard_size: scenes in a file.
+      engine: native (CPU), mjx (XLA), or auto.
+      timestep: seconds of a physics step (native).
+      shard: this worker's number.
+      of: number of workers; each makes every of-th shard of the same data set.
+    """
+    job = Job("images", _scene(objects), episodes, seed, shard_size, 1, engine, timestep)
+    generate(job, out, part=shard, of=of)
+
+
+def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
+    """Check every shard against the manifest's sizes and SHA-256; exit 2 if one is wrong.
+
+    Args:
+      folder: a data set.
+    """
+    problems = records.verify(folder)
+    if problems:
+        path, what = problems[0]
+        raise UserError(f"{path}: {what} ({len(problems)} wrong in all); run dipn-datagen repair {folder}")
+    console.say(f"{folder}: all shards are whole")
+
+
+def repair(folder: tyro.conf.Positional[pathlib.Path]) -> None:
+    """Delete damaged shards and rebuild the manifest; the command that made the data set then fills the gaps.
+
+    Args:
+      folder: a data set.
+    """
+    if not folder.is_dir():
+        raise UserError(f"data set {folder}: no such folder; give a folder that dipn-datagen wrote")
+    removed = records.repair(folder)
+    console.say(f"{folder}: {len(removed)} damaged shards removed {[p.name for p in removed]}; generate again to fill")
+
+
+def info(folder: tyro.conf.Positional[pathlib.Path]) -> None:
+    """Print what a data set holds, as JSON: episodes, bytes, config, versions, faults counted.
+
+    Args:
+      folder: a data set.
+    """
+    console.say(json.dumps(records.summary(folder), indent=1))
+
+
+def main() -> None:
+    """Entry point."""
+    commands = {"push": push, "grasp": grasp, "images": images, "verify": verify, "repair": repair, "info": info}
+    sys.exit(console.run("Generate push and grasp episodes with rigid-body physics.", commands))
+
+
+if __name__ == "__main__":
+    main()

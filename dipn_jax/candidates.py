@@ -1,0 +1,108 @@
+"""Push sampling: contacts on the contours of object bundles, directions toward the object, feasibility.
+
+Everything runs on the device on a padded number of candidates; nothing is traced out point by point.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from dipn_jax import geometry
+from dipn_jax.structs import ABSENT, Observation, Push
+from dipn_jax.workspace import GRIPPER, WORKSPACE
+
+# Source of the four numbers below: DIPN's released code.
+STANDOFF = 15  # pixels from the contact back to the start
+START_RANGE = (10, 214)  # pixels
+CENTER_RANGE = (25, 199)  # pixels: a centre predicted outside (at twice the motion) drops the push
+FREE_HEIGHT = 0.01  # metres: what is lower counts as free at the start
+
+_OVERSAMPLE = 4
+_MARGIN = 0.004  # metres around the gripper's footprint
+
+
+def mask_centers(label: jax.Array, slots: int) -> tuple[jax.Array, jax.Array]:
+    """Centroids of the visible masks.
+
+    Args:
+      label: `[H, W]` int32 object slots, ABSENT on the table.
+      slots: N.
+
+    Returns:
+      Centroid `[N, 2]` in metres (workspace, of a map centred on it) and size `[N]` in pixels; the
+      centroid of an object out of sight is 0.
+    """
+    h, w = label.shape
+    hot = (label.reshape(1, -1) == jnp.arange(slots)[:, None]).astype(jnp.float32)
+    grid = (geometry.view_grid(h, w) - jnp.array([(w - 1) / 2, (h - 1) / 2])) * WORKSPACE.pixel
+    area = hot.sum(-1)
+    center = jnp.dot(hot, grid.reshape(-1, 2), precision="highest") / jnp.maximum(area, 1.0)[:, None]
+    return center, area
+
+
+def contour(foreground: jax.Array) -> jax.Array:
+    """Foreground pixels `[H, W]` bool with a neighbour (of eight) on the table or outside the map."""
+    window = (3, 3)
+    inner = jax.lax.reduce_window(foreground.astype(jnp.int32), 1, jax.lax.min, window, (1, 1), ((1, 1), (1, 1)))
+    padded = jnp.pad(foreground, 1)
+    edge = jax.lax.reduce_window(padded.astype(jnp.int32), 1, jax.lax.min, window, (1, 1), "VALID")
+    return foreground & ((inner == 0) | (edge == 0))
+
+
+def footprint_free(height: jax.Array, start: jax.Array, angle: jax.Array) -> jax.Array:
+    """Whether the closed gripper can come down at `start [2]` (metres), broad side toward `angle []`."""
+    along = jnp.linspace(-0.5, 0.5, 7) * (GRIPPER.pad_width + _MARGIN)
+    across = jnp.linspace(-0.5, 0.5, 13) * (GRIPPER.push_width + _MARGIN)
+    local = jnp.stack(jnp.meshgrid(along, across, indexing="ij"), -1).reshape(-1, 2)
+    pixels = geometry.metres_to_pixels(start + geometry.rotate2d(local, angle))
+    return jnp.all(geometry.sample_nearest(height, pixels, 0.0) < FREE_HEIGHT)
+
+
+@functools.partial(jax.jit, static_argnames=("count", "slots"))
+def sample_pushes(
+    key: jax.Array, observation: Observation, *, count: int, slots: int, distance: jax.Array | float
+) -> tuple[Push, jax.Array]:
+    """Candidate pushes of one observation.
+
+    Args:
+      key: random key.
+      observation: `[224, 224]` maps.
+      count: number of candidates P.
+      slots: number of object slots N in the labels.
+      distance: metres, traced.
+
+    Returns:
+      Pushes `[P]` and which of them are feasible `[P]` bool. Feasible ones come first, in random order;
+      where there are fewer than `count`, the rest is flagged.
+    """
+    label, height = observation.label, observation.height
+    on_contour = contour(label != ABSENT).reshape(-1)
+    noise = jax.random.uniform(key, on_contour.shape)
+    _, index = jax.lax.top_k(jnp.where(on_contour, noise, -1.0), _OVERSAMPLE * count)
+    width = label.shape[1]
+    contact = geometry.pixels_to_metres(jnp.stack([index % width, index // width], -1))
+    owner = jnp.maximum(label.reshape(-1)[index], 0)
+    centers, _ = mask_centers(label, slots)
+    toward = centers[owner] - contact
+    angle = jnp.arctan2(toward[:, 1], toward[:, 0])
+    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+    start = contact - STANDOFF * WORKSPACE.pixel * direction
+    pixel = geometry.metres_to_pixels(start)
+    inside = ((pixel >= START_RANGE[0]) & (pixel <= START_RANGE[1])).all(-1)
+    free = jax.vmap(footprint_free, in_axes=(None, 0, 0))(height, start, angle)
+    feasible = on_contour[index] & inside & free
+    chosen = jnp.argsort(~feasible, stable=True)[:count]
+    distances = jnp.full((count,), distance, jnp.float32)
+    return Push(start[chosen], angle[chosen], distances), feasible[chosen]
+
+
+def stays_inside(centers: jax.Array, area: jax.Array, motion: jax.Array) -> jax.Array:
+    """Whether no visible centre `[N, 2]` (metres) leaves CENTER_RANGE at twice the predicted `motion [N, 3]`."""
+    pixel = geometry.metres_to_pixels(centers + 2 * motion[:, :2])
+    before = geometry.metres_to_pixels(centers)
+    low, high = CENTER_RANGE
+    out = ((pixel < low) & (pixel < before)) | ((pixel > high) & (pixel > before))
+    return ~(out.any(-1) & (area > 0)).any()

@@ -1,0 +1,120 @@
+"""What the three commands share with a terminal: progress, one-line errors, the compilation cache.
+
+One of the two modules of the library that print or know folders of the machine (the other is `checkpoint`).
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import sys
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any
+
+import jax
+import rich.progress
+import tyro
+
+from dipn_jax.errors import UserError
+
+LOG_PERIOD = 10.0
+"""Seconds between progress lines where there is no terminal."""
+
+
+def enable_compilation_cache() -> None:
+    """Keep compiled programs in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`)."""
+    home = os.environ.get("XDG_CACHE_HOME") or str(pathlib.Path.home() / ".cache")
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(pathlib.Path(home) / "dipn-jax" / "xla")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+class Progress:
+    """A bar on a terminal, a line every few seconds in a log. Use as a context manager."""
+
+    def __init__(self, title: str, total: int, *, unit: str, done: int = 0) -> None:
+        self.title, self.total, self.unit = title, total, unit
+        self.done, self.begun_at = done, done
+        self.note = ""
+        self._bar: rich.progress.Progress | None = None
+        if sys.stderr.isatty():
+            self._bar = rich.progress.Progress(
+                rich.progress.TextColumn("{task.description}"),
+                rich.progress.BarColumn(),
+                rich.progress.MofNCompleteColumn(),
+                rich.progress.TextColumn("{task.fields[note]}"),
+                rich.progress.TimeRemainingColumn(),
+                console=rich.console.Console(stderr=True),
+            )
+            self._task = self._bar.add_task(title, total=total, completed=done, note="")
+        self._begun = time.monotonic()
+        self._logged = self._begun
+
+    def __enter__(self) -> Progress:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar:
+            self._bar.stop()
+        elif kind is None:
+            self._line()
+
+    def advance(self, amount: int, note: str = "") -> None:
+        """`amount` more are done; `note` is shown beside the count."""
+        self.done += amount
+        self.note = note
+        if self._bar:
+            self._bar.update(self._task, completed=self.done, note=note)
+        elif time.monotonic() - self._logged > LOG_PERIOD:
+            self._line()
+
+    def _line(self) -> None:
+        self._logged = time.monotonic()
+        seconds = max(self._logged - self._begun, 1e-9)
+        rate = (self.done - self.begun_at) / seconds
+        left = (self.total - self.done) / rate if rate > 0 else float("inf")
+        note = f", {self.note}" if self.note else ""
+        print(
+            f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f}/s, {left:.0f} s left{note}",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
+def say(text: str) -> None:
+    """One line for the user, on standard output."""
+    print(text, flush=True)
+
+
+def require_positive(**values: float) -> None:
+    """UserError for the first value that is not above zero."""
+    for name, value in values.items():
+        if value <= 0:
+            raise UserError(f"--{name.replace('_', '-')} {value}: want a number above 0")
+
+
+def run(description: str, commands: dict[str, Callable[..., Any]], arguments: Sequence[str] | None = None) -> int:
+    """Parse and run one of `commands`.
+
+    Returns:
+      The exit code: 0, or 2 after one line on standard error for a mistake of the user's; 130 when interrupted
+      (what was written before stays valid, and the same command goes on from there).
+    """
+    enable_compilation_cache()
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            commands, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,)
+        )
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on from here", file=sys.stderr)
+        return 130
+    return 0

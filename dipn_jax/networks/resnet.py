@@ -1,0 +1,124 @@
+"""Residual trunks: the published ResNet-50, and small ones without normalization for CPUs."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+
+def conv(
+    features_in: int, features: int, size: int | tuple[int, int], rngs: nnx.Rngs, *, stride: int = 1, bias: bool = True
+) -> nnx.Conv:
+    """A `size` x `size` convolution, padded to keep the resolution (over `stride`)."""
+    kernel = (size, size) if isinstance(size, int) else size
+    pad = [(k // 2, k // 2) for k in kernel]
+    return nnx.Conv(features_in, features, kernel, strides=(stride, stride), padding=pad, use_bias=bias, rngs=rngs)
+
+
+class Bottleneck(nnx.Module):
+    """1x1, 3x3, 1x1 with batch normalization (He et al. 2016); the stride sits in the 3x3."""
+
+    def __init__(self, features_in: int, width: int, stride: int, rngs: nnx.Rngs) -> None:
+        out = 4 * width
+        self.reduce = conv(features_in, width, 1, rngs, bias=False)
+        self.spatial = conv(width, width, 3, rngs, stride=stride, bias=False)
+        self.expand = conv(width, out, 1, rngs, bias=False)
+        self.norms = nnx.List([nnx.BatchNorm(f, rngs=rngs) for f in (width, width, out)])
+        self.project: nnx.Conv | None = None
+        self.project_norm: nnx.BatchNorm | None = None
+        if stride != 1 or features_in != out:
+            self.project = conv(features_in, out, 1, rngs, stride=stride, bias=False)
+            self.project_norm = nnx.BatchNorm(out, rngs=rngs)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        y = nnx.relu(self.norms[0](self.reduce(x)))
+        y = nnx.relu(self.norms[1](self.spatial(y)))
+        y = self.norms[2](self.expand(y))
+        if self.project is not None and self.project_norm is not None:
+            x = self.project_norm(self.project(x))
+        return nnx.relu(x + y)
+
+
+class ResNet(nnx.Module):
+    """Bottleneck ResNet; `stages=(3, 4, 6, 3)` is ResNet-50.
+
+    Input `[B, H, W, C]`; returns the four stages' maps at strides 4, 8, 16, 32 with 256, 512, 1024 and
+    2048 channels.
+    """
+
+    def __init__(self, features_in: int, stages: Sequence[int], rngs: nnx.Rngs) -> None:
+        self.stem = conv(features_in, 64, 7, rngs, stride=2, bias=False)
+        self.stem_norm = nnx.BatchNorm(64, rngs=rngs)
+        blocks, features = [], 64
+        for stage, count in enumerate(stages):
+            width = 64 * 2**stage
+            row = []
+            for i in range(count):
+                row.append(Bottleneck(features, width, 2 if stage > 0 and i == 0 else 1, rngs))
+                features = 4 * width
+            blocks.append(nnx.List(row))
+        self.blocks = nnx.List(blocks)
+
+    def __call__(self, x: jax.Array) -> list[jax.Array]:
+        x = nnx.relu(self.stem_norm(self.stem(x)))
+        x = nnx.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
+        maps = []
+        for row in self.blocks:
+            for block in row:
+                x = block(x)
+            maps.append(x)
+        return maps
+
+
+class PlainBlock(nnx.Module):
+    """Two 3x3 convolutions with a residual that starts at zero, so that it needs no normalization."""
+
+    def __init__(self, features: int, rngs: nnx.Rngs) -> None:
+        self.first = conv(features, features, 3, rngs)
+        zero = functools.partial(nnx.Conv, kernel_init=nnx.initializers.zeros)
+        self.second = zero(features, features, (3, 3), padding="SAME", rngs=rngs)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return nnx.relu(x + self.second(nnx.relu(self.first(x))))
+
+
+class MLP(nnx.Module):
+    """Dense layers of the given sizes with ReLU between (and after, unless `linear_end`)."""
+
+    def __init__(self, features_in: int, sizes: Sequence[int], rngs: nnx.Rngs, *, linear_end: bool = False) -> None:
+        layers, features = [], features_in
+        for size in sizes:
+            layers.append(nnx.Linear(features, size, rngs=rngs))
+            features = size
+        self.layers = nnx.List(layers)
+        self.linear_end = linear_end
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for i, layer in enumerate(self.layers):
+            x = layer(x)
+            if i + 1 < len(self.layers) or not self.linear_end:
+                x = nnx.relu(x)
+        return x
+
+
+def space_to_depth(x: jax.Array, block: int) -> jax.Array:
+    """`[B, H, W, C]` to `[B, H / block, W / block, block^2 C]`."""
+    b, h, w, c = x.shape
+    x = x.reshape(b, h // block, block, w // block, block, c).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(b, h // block, w // block, block * block * c)
+
+
+def depth_to_space(x: jax.Array, block: int) -> jax.Array:
+    """Inverse of `space_to_depth`."""
+    b, h, w, c = x.shape
+    x = x.reshape(b, h, w, block, block, c // block**2).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(b, h * block, w * block, c // block**2)
+
+
+def upsample2(x: jax.Array) -> jax.Array:
+    """Nearest-neighbour doubling of `[B, H, W, C]`."""
+    return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)

@@ -1,0 +1,106 @@
+"""Scene and poses -> what an orthographic camera straight above sees. Pure, batched, without OpenGL.
+
+A vertical ray meets a convex part between its highest lower plane and its lowest upper plane, so a height
+map is a minimum and a maximum of affine functions of the pixel, taken in a window around each object.
+Any other view (turned into a push's frame, a crop around a grasp) is a render of transformed poses.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from dipn_jax import geometry, shapes
+from dipn_jax.structs import ABSENT, Observation, Scene
+from dipn_jax.workspace import WORKSPACE
+
+WINDOW = 64
+"""Pixels: at 2 mm a pixel it holds any object of diagonal `shapes.MAX_DIAGONAL`."""
+TABLE_COLOR = (0.2, 0.2, 0.2)
+_STEEP = 1e-6  # |n_z| below which a face is taken as vertical
+_FAR = 1e3
+
+
+def _bounds(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Affine bounds on z, `[N, P, F, 3]` each (constant, x, y): every z must be under the first, over the second."""
+    hulls = jax.vmap(shapes.hull)(scene.shape, scene.size)
+    rotation = geometry.quat_to_matrix(poses[:, 3:])
+    normal = jnp.einsum("nij,npfj->npfi", rotation, hulls.normals)
+    offset = hulls.offsets + jnp.einsum("npfi,ni->npf", normal, poses[:, :3])
+    nz = jnp.where(jnp.abs(normal[..., 2]) < _STEEP, _STEEP, normal[..., 2])
+    plane = jnp.stack([offset / nz, -normal[..., 0] / nz, -normal[..., 1] / nz], -1)
+    never = jnp.array([_FAR, 0.0, 0.0])
+    up = nz > 0
+    upper = jnp.where(up[..., None], plane, never)
+    lower = jnp.where(up[..., None], -never, plane)
+    dead = ~hulls.alive[:, :, None, None]
+    return jnp.where(dead, -never, upper), lower
+
+
+def _part_heights(upper: jax.Array, lower: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Top of an object over pixels `x [W]`, `y [H]`; `-_FAR` beside it. Planes `[P, F, 3]`."""
+
+    def evaluate(plane: jax.Array) -> jax.Array:
+        return plane[0] + plane[1] * x[None, :] + plane[2] * y[:, None]
+
+    best = jnp.full((y.shape[0], x.shape[0]), -_FAR)
+    for part in range(upper.shape[0]):
+        top = functools.reduce(jnp.minimum, [evaluate(plane) for plane in upper[part]])
+        bottom = functools.reduce(jnp.maximum, [evaluate(plane) for plane in lower[part]])
+        best = jnp.where(top >= bottom, jnp.maximum(best, top), best)
+    return best
+
+
+@functools.partial(jax.jit, static_argnames=("pixels",))
+def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> tuple[jax.Array, jax.Array]:
+    """Height map and labels of one scene.
+
+    Args:
+      scene: `[N]`.
+      poses: `[N, 7]`, workspace frame.
+      pixels: side of the square view, centred on the workspace, 2 mm a pixel.
+
+    Returns:
+      Height `[pixels, pixels]` in metres (0 on the table) and label `[pixels, pixels]` int32 (ABSENT on the table).
+    """
+    n = scene.shape.shape[0]
+    side = min(WINDOW, pixels)
+    upper, lower = _bounds(scene, poses)
+    middle = (pixels - 1) / 2
+    corner = jnp.floor(poses[:, :2] / WORKSPACE.pixel + middle - side / 2 + 1).astype(jnp.int32)
+    corner = jnp.clip(jnp.nan_to_num(corner), 0, pixels - side)
+
+    def paint(i: jax.Array, maps: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        height, label = maps
+        col, row = corner[i, 0], corner[i, 1]
+        x = (col + jnp.arange(side) - middle) * WORKSPACE.pixel
+        y = (row + jnp.arange(side) - middle) * WORKSPACE.pixel
+        top = _part_heights(upper[i], lower[i], x, y)
+        old_height = jax.lax.dynamic_slice(height, (row, col), (side, side))
+        old_label = jax.lax.dynamic_slice(label, (row, col), (side, side))
+        seen = top > old_height
+        height = jax.lax.dynamic_update_slice(height, jnp.where(seen, top, old_height), (row, col))
+        return height, jax.lax.dynamic_update_slice(label, jnp.where(seen, i, old_label), (row, col))
+
+    start = (jnp.zeros((pixels, pixels)), jnp.full((pixels, pixels), ABSENT, jnp.int32))
+    return jax.lax.fori_loop(0, n, paint, start)
+
+
+@functools.partial(jax.jit, static_argnames=("pixels",))
+def render(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> Observation:
+    """What the camera sees of one scene; arguments as `render_depth`."""
+    height, label = render_depth(scene, poses, pixels=pixels)
+    return Observation(height, paint_labels(label, scene.color), label)
+
+
+def paint_labels(label: jax.Array, color: jax.Array) -> jax.Array:
+    """Colours `[H, W, 3]` of a label map `[H, W]` with object colours `[N, 3]`; the table elsewhere."""
+    palette = jnp.concatenate([color, jnp.array([TABLE_COLOR])])
+    return palette[jnp.where(label == ABSENT, color.shape[0], label)]
+
+
+def rgbd(observation: Observation) -> jax.Array:
+    """The image `[H, W, 4]` that networks see: RGB in [0, 1] and height in metres."""
+    return jnp.concatenate([observation.color, observation.height[..., None]], -1)
