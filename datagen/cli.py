@@ -17,20 +17,6 @@ from dipn_jax.physics import EngineName
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
 
-def _scene(objects: str) -> scenes.SceneConfig:
-    if objects == "paper":
-        return scenes.SceneConfig()
-    low, _, high = objects.partition(":")
-    try:
-        first, last = int(low), int(high or low)
-    except ValueError:
-        raise UserError(f"--objects {objects}: want a number, a range like 1:7, or paper") from None
-    if not 1 <= first <= last <= 30:
-        raise UserError(f"--objects {objects}: want 1 to 30, smaller number first")
-    counts = (0.0,) * (first - 1) + (1.0 / (last - first + 1),) * (last - first + 1)
-    return scenes.SceneConfig(slots=last, counts=counts)
-
-
 def push(
     out: pathlib.Path,
     episodes: int = 1500,
@@ -60,7 +46,7 @@ def push(
       shard: this worker's number.
       of: number of workers; each makes every of-th shard of the same data set.
     """
-    job = Job("push", _scene(objects), episodes, seed, shard_size, actions, engine, timestep)
+    job = Job("push", scenes.parse_objects(objects), episodes, seed, shard_size, actions, engine, timestep)
     generate(job, out, part=shard, of=of)
 
 
@@ -93,7 +79,7 @@ def grasp(
       shard: this worker's number.
       of: number of workers; each makes every of-th shard of the same data set.
     """
-    job = Job("grasp", _scene(objects), episodes, seed, shard_size, actions, engine, timestep)
+    job = Job("grasp", scenes.parse_objects(objects), episodes, seed, shard_size, actions, engine, timestep)
     generate(job, out, part=shard, of=of)
 
 
@@ -123,7 +109,7 @@ def images(
       shard: this worker's number.
       of: number of workers; each makes every of-th shard of the same data set.
     """
-    job = Job("images", _scene(objects), episodes, seed, shard_size, 1, engine, timestep)
+    job = Job("images", scenes.parse_objects(objects), episodes, seed, shard_size, 1, engine, timestep)
     generate(job, out, part=shard, of=of)
 
 

@@ -7,26 +7,21 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import candidates, geometry, primitives, records, render, scenes
+from dipn_jax import candidates, clutter, primitives, records, scenes
 from dipn_jax.physics import Engine
 from dipn_jax.structs import (
-    ABSENT,
     Fault,
     Grasp,
     GraspEpisode,
     Observation,
     Push,
     PushEpisode,
-    Scene,
     SettledScene,
 )
-from dipn_jax.workspace import PUSH_STEPS, ROTATIONS
+from dipn_jax.workspace import PUSH_STEPS
 
-BATCH = 64
-"""Scenes that compiled functions take at a time."""
 UNUSABLE = Fault.NON_FINITE | Fault.CAPACITY | Fault.SPEED | Fault.PENETRATION
 """Faults of an action that drop the episode: the simulation is wrong. Others are physics and stay, flagged."""
 
@@ -39,49 +34,21 @@ class Batch:
     counts: dict[str, int]
 
 
-def settled(
-    key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int
-) -> tuple[SettledScene, dict[str, int]]:
-    """Drop `count` scenes (at most BATCH) and keep those that came to rest inside the workspace without a fault."""
-    made = _random_scenes(jax.random.split(key, BATCH), config)
-    scene, poses = records.take(made, slice(0, count))
-    rollout = primitives.settle(engine, scene, poses)
-    fault = np.asarray(rollout.fault)
-    everything = SettledScene(scene, rollout.poses[:, -1], fault)
-    counts = {f"settle_{name}": n for name, n in Fault.count(fault).items()}
-    return records.take(everything, fault == 0), {"dropped_scenes": count, **counts}
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _random_scenes(keys: jax.Array, config: scenes.SceneConfig) -> tuple[Scene, jax.Array]:
-    return jax.vmap(lambda k: scenes.random_scene(k, config=config))(keys)
-
-
-def observe(scene: Scene, poses: Any) -> Observation:
-    """Observations `[B]`, one jitted program whatever the batch: scenes go through it one by one."""
-    return _observe(jax.tree.map(jnp.asarray, scene), jnp.asarray(poses))
-
-
-@jax.jit
-def _observe(scene: Scene, poses: jax.Array) -> Observation:
-    return jax.lax.map(lambda pair: render.render(*pair), (scene, poses))
-
-
 def _padded(items: SettledScene) -> tuple[SettledScene, int]:
-    """Repeat scenes up to BATCH, so that compiled shapes stay few; also the true number."""
+    """Repeat scenes up to clutter.BATCH, so that compiled shapes stay few; also the true number."""
     n = len(items.fault)
-    return records.take(items, np.arange(BATCH) % n), n
+    return records.take(items, np.arange(clutter.BATCH) % n), n
 
 
 def push_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
     """`actions` different 10 cm pushes on each of up to `count` settled scenes."""
     drop, aim = jax.random.split(key)
-    items, counts = settled(drop, engine, config, count)
+    items, counts = clutter.settled(drop, engine, config, count)
     if not len(items.fault):
         return Batch(None, counts)
     padded, n = _padded(items)
-    observation = observe(padded.scene, padded.poses)
-    pushes, feasible = _aim_pushes(jax.random.split(aim, BATCH), observation, actions, config.slots)
+    observation = clutter.observe(padded.scene, padded.poses)
+    pushes, feasible = _aim_pushes(jax.random.split(aim, clutter.BATCH), observation, actions, config.slots)
     keep = np.asarray(feasible)[:n].reshape(-1)
     pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:])[keep], pushes)
     repeated = records.take(items, np.repeat(np.arange(n), actions)[keep])
@@ -105,12 +72,12 @@ def _aim_pushes(keys: jax.Array, observation: Observation, actions: int, slots: 
 def grasp_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
     """`actions` grasps at random foreground pixels and angles on each of up to `count` settled scenes."""
     drop, aim = jax.random.split(key)
-    items, counts = settled(drop, engine, config, count)
+    items, counts = clutter.settled(drop, engine, config, count)
     if not len(items.fault):
         return Batch(None, counts)
     padded, n = _padded(items)
-    observation = observe(padded.scene, padded.poses)
-    grasps = random_foreground(jax.random.split(aim, BATCH), observation, actions)
+    observation = clutter.observe(padded.scene, padded.poses)
+    grasps = _aim_grasps(jax.random.split(aim, clutter.BATCH), observation, actions)
     grasps = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:]), grasps)
     repeated = records.take(items, np.repeat(np.arange(n), actions))
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
@@ -127,25 +94,13 @@ def grasp_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, c
 
 
 @functools.partial(jax.jit, static_argnames="actions")
-def random_foreground(keys: jax.Array, observation: Observation, actions: int) -> Grasp:
-    """Grasps `[B, actions]` at uniformly random foreground pixels and one of 16 angles."""
-
-    def one(args: tuple[jax.Array, Observation]) -> Grasp:
-        key, seen = args
-        pixel_key, angle_key = jax.random.split(key)
-        noise = jax.random.uniform(pixel_key, (seen.label.size,))
-        _, index = jax.lax.top_k(jnp.where(seen.label.reshape(-1) != ABSENT, noise, -1.0), actions)
-        width = seen.label.shape[1]
-        center = geometry.pixels_to_metres(jnp.stack([index % width, index // width], -1))
-        angle = jax.random.randint(angle_key, (actions,), 0, ROTATIONS) * (2 * jnp.pi / ROTATIONS)
-        return Grasp(center, angle, primitives.grasp_height(seen.height.reshape(-1)[index]))
-
-    return jax.lax.map(one, (keys, observation))
+def _aim_grasps(keys: jax.Array, observation: Observation, actions: int) -> Grasp:
+    return jax.lax.map(lambda args: candidates.random_grasps(args[0], args[1], count=actions), (keys, observation))
 
 
 def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
     """Settled scenes, nothing done to them."""
-    items, counts = settled(key, engine, config, count)
+    items, counts = clutter.settled(key, engine, config, count)
     return Batch(items if len(items.fault) else None, counts)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from datagen import episodes
-from dipn_jax import console, model, records
+from dipn_jax import clutter, console, model, records
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, EngineName, make_engine
 from dipn_jax.scenes import SceneConfig
@@ -52,7 +52,7 @@ def shard(job: Job, index: int, engine: Engine, progress: console.Progress) -> t
     while have < want:
         key, batch_key = jax.random.split(key)
         # a tenth more than needed, for scenes that are dropped
-        count = min(episodes.BATCH, int(1.1 * (want - have) / job.actions) + 1)
+        count = min(clutter.BATCH, int(1.1 * (want - have) / job.actions) + 1)
         batch = episodes.MAKERS[job.kind](batch_key, engine, job.scene, count=count, actions=job.actions)
         counts.update(batch.counts)
         empty = empty + 1 if batch.episodes is None else 0

@@ -1,4 +1,4 @@
-"""Push sampling: contacts on the contours of object bundles, directions toward the object, feasibility.
+"""Which actions to consider: pushes from the contours of object bundles, grasps at pixels.
 
 Everything runs on the device on a padded number of candidates; nothing is traced out point by point.
 """
@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from dipn_jax import geometry
-from dipn_jax.structs import ABSENT, Observation, Push
-from dipn_jax.workspace import GRIPPER, WORKSPACE
+from dipn_jax.structs import ABSENT, Array, Grasp, Observation, Push
+from dipn_jax.workspace import GRIPPER, ROTATIONS, WORKSPACE
 
 # Source of the four numbers below: DIPN's released code.
 STANDOFF = 15  # pixels from the contact back to the start
@@ -106,3 +106,27 @@ def stays_inside(centers: jax.Array, area: jax.Array, motion: jax.Array) -> jax.
     low, high = CENTER_RANGE
     out = ((pixel < low) & (pixel < before)) | ((pixel > high) & (pixel > before))
     return ~(out.any(-1) & (area > 0)).any()
+
+
+def grasp_height(local_height: Array) -> jax.Array:
+    """Tip height for a surface `local_height [...]` metres above the table. Source: DIPN's released code."""
+    return jnp.maximum(jnp.asarray(local_height) - 0.04, 0.02)
+
+
+def grasp_at(index: Array, height: jax.Array) -> Grasp:
+    """The grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres)."""
+    index = jnp.asarray(index)
+    rotation, row, col = index[..., 0], index[..., 1], index[..., 2]
+    center = geometry.pixels_to_metres(jnp.stack([col, row], -1))
+    return Grasp(center, rotation * jnp.float32(2 * jnp.pi / ROTATIONS), grasp_height(height[row, col]))
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Grasp:
+    """`count` grasps at uniformly random foreground pixels, each at one of the 16 angles."""
+    pixel_key, angle_key = jax.random.split(key)
+    noise = jax.random.uniform(pixel_key, (observation.label.size,))
+    _, pixel = jax.lax.top_k(jnp.where(observation.label.reshape(-1) != ABSENT, noise, -1.0), count)
+    width = observation.label.shape[1]
+    rotation = jax.random.randint(angle_key, (count,), 0, ROTATIONS)
+    return grasp_at(jnp.stack([rotation, pixel // width, pixel % width], -1), observation.height)

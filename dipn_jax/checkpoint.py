@@ -1,8 +1,8 @@
 """The only owner of checkpoints: Orbax arrays, the config that rebuilds the network, and checksums.
 
-`RUN/checkpoints/STEP/` holds one Orbax folder a part (`model`, `train`) and `meta.json`. Orbax restores flipped bits silently and takes
-an empty step folder for the latest, so every file's SHA-256 is kept and reading walks back to the
-newest step that is whole.
+`RUN/checkpoints/STEP/` holds one Orbax folder a part (`model`, `train`) and `meta.json`. Orbax restores
+flipped bits silently and takes an empty step folder for the latest, so every file's SHA-256 is kept and
+reading walks back to the newest step that is whole.
 """
 
 from __future__ import annotations

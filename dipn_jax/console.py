@@ -9,7 +9,7 @@ import os
 import pathlib
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -99,7 +99,7 @@ def require_positive(**values: float) -> None:
             raise UserError(f"--{name.replace('_', '-')} {value}: want a number above 0")
 
 
-def run(description: str, commands: dict[str, Callable[..., Any]], arguments: Sequence[str] | None = None) -> int:
+def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | None = None) -> int:
     """Parse and run one of `commands`.
 
     Returns:

@@ -183,7 +183,8 @@ def mjcf(
  <numeric name="max_contact_points" data="{c.contact_points}"/></custom>
 <default><geom solref="{c.solref}" solimp="{c.solimp}"/>
  <default class="object"><geom contype="1" conaffinity="3" condim="3"/></default>
- <default class="link"><geom contype="2" conaffinity="0" condim="3" priority="1" friction="0.35 0.005 0.0001"/></default>
+ <default class="link">
+  <geom contype="2" conaffinity="0" condim="3" priority="1" friction="0.35 0.005 0.0001"/></default>
  <default class="pad"><geom contype="2" conaffinity="0" condim="4" priority="2" friction="1 0.01 0.0001"/></default>
 </default>
 <asset>{extra}{"".join(a for _, a in parts)}</asset>

@@ -52,7 +52,7 @@ def dipn_predictor(model: dipn.DIPN, slots: int) -> Predictor:
         network = thaw()
         make = functools.partial(dipn.push_input, slots=slots, stride=stride)
         inputs, _ = jax.vmap(make, in_axes=(None, 0))(observation.label, pushes)
-        return dipn.to_workspace(network(inputs), pushes.angle)  # type: ignore[operator]
+        return dipn.to_workspace(network(inputs), pushes.angle)
 
     return predict
 

@@ -103,8 +103,3 @@ def grasp_outcome(scenes: Scene, rollout: Rollout) -> Outcome:
     rise = rollout.poses[..., -1, :, 2] - rollout.poses[..., 0, :, 2]
     held = (scenes.shape >= 0) & (rise > HELD_RISE * GRIPPER.lift)
     return Outcome(held, held.any(-1))
-
-
-def grasp_height(local_height: Array) -> jax.Array:
-    """Tip height for a surface `local_height` metres above the table. Source: DIPN's released code."""
-    return jnp.maximum(jnp.asarray(local_height) - 0.04, 0.02)

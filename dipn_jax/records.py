@@ -303,6 +303,6 @@ def concatenate(batches: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *batches)
 
 
-def take(episodes: Any, index: np.ndarray | slice) -> Any:
+def take(episodes: Any, index: np.ndarray | slice | int) -> Any:
     """Episodes `index` of a batched struct, as numpy."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[index], episodes)

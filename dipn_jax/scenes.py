@@ -14,7 +14,7 @@ import numpy as np
 
 from dipn_jax import geometry, shapes
 from dipn_jax.errors import UserError
-from dipn_jax.structs import ABSENT, Scene
+from dipn_jax.structs import ABSENT, Array, Scene
 from dipn_jax.workspace import WORKSPACE
 
 PAPER_COUNTS = (0.02, 0.05, 0.2, 0.35, 0.3, 0.05, 0.03)
@@ -49,6 +49,25 @@ class SceneConfig:
 def fixed_count(count: int, **changes: Any) -> SceneConfig:
     """A config with exactly `count` objects."""
     return SceneConfig(slots=count, counts=(0.0,) * (count - 1) + (1.0,), **changes)
+
+
+def parse_objects(text: str) -> SceneConfig:
+    """A config from a user's word: `10`, `1:7` (uniform) or `paper` (PAPER_COUNTS).
+
+    Raises:
+      UserError: the text is none of these.
+    """
+    if text == "paper":
+        return SceneConfig()
+    low, _, high = text.partition(":")
+    try:
+        first, last = int(low), int(high or low)
+    except ValueError:
+        raise UserError(f"--objects {text}: want a number, a range like 1:7, or paper") from None
+    if not 1 <= first <= last <= 30:
+        raise UserError(f"--objects {text}: want 1 to 30, smaller number first")
+    counts = (0.0,) * (first - 1) + (1.0 / (last - first + 1),) * (last - first + 1)
+    return SceneConfig(slots=last, counts=counts)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -111,7 +130,7 @@ def parked(n: int) -> jax.Array:
     return jnp.stack([x, zero + 5.0, zero + 1.0, one, zero, zero, zero], -1)
 
 
-def remove(scene: Scene, poses: jax.Array, gone: jax.Array) -> tuple[Scene, jax.Array]:
+def remove(scene: Scene, poses: Array, gone: Array) -> tuple[Scene, jax.Array]:
     """The scene without the objects `gone [N]`."""
     shape = jnp.where(gone, ABSENT, scene.shape)
     return scene.replace(shape=shape), jnp.where(gone[:, None], parked(len(gone)), poses)

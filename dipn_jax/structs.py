@@ -10,13 +10,13 @@ toward +y. Maps are indexed `[row, col]`, row along +y and col along +x.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar, TypeAlias
 
 import flax.struct
-import jax
 import numpy as np
 
-Array = jax.Array | np.ndarray
+Array: TypeAlias = Any
+"""A jax.Array on the device, an np.ndarray on the host: every type below serves both."""
 
 ABSENT = -1
 """Value of `Scene.shape` in an empty slot."""
@@ -33,7 +33,7 @@ class Fault:
     PENETRATION = 32  # an object sank into the table
     SHORT = 64  # the gripper did not reach its commanded pose
 
-    NAMES = {
+    NAMES: ClassVar[dict[int, str]] = {
         1: "non_finite",
         2: "capacity",
         4: "unsettled",

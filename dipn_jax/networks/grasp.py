@@ -6,7 +6,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 
 from dipn_jax import geometry, render
@@ -155,10 +154,3 @@ def geometric_labels(height: jax.Array) -> jax.Array:
 
     fingers = jnp.maximum(highest(-28, -19, 4), highest(19, 28, 4))
     return ((height > tip + 0.005) & (fingers < tip)).astype(jnp.float32)
-
-
-def pixel_to_grasp(index: np.ndarray | jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Grasp centre `[..., 2]` (metres) and closing angle `[...]` (radians) of `index [..., 3]` (rotation, row, col)."""
-    index = jnp.asarray(index)
-    center = geometry.pixels_to_metres(jnp.stack([index[..., 2], index[..., 1]], -1))
-    return center, index[..., 0] * jnp.float32(2 * np.pi / ROTATIONS)

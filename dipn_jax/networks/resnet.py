@@ -15,7 +15,7 @@ def conv(
 ) -> nnx.Conv:
     """A `size` x `size` convolution, padded to keep the resolution (over `stride`)."""
     kernel = (size, size) if isinstance(size, int) else size
-    pad = [(k // 2, k // 2) for k in kernel]
+    pad = tuple((k // 2, k // 2) for k in kernel)  # a tuple: graph definitions are hashed
     return nnx.Conv(features_in, features, kernel, strides=(stride, stride), padding=pad, use_bias=bias, rngs=rngs)
 
 

@@ -31,12 +31,12 @@ SKIN = 1e-3
 """Metres above the lowest corner within which corners count as touching a plane."""
 MERGE = 1e-5
 """Metres: contacts of one pair nearer than this are one."""
-NARROW = 8
-"""Pairs of one kind (object-object, object-link, object-pad) tested for edges; others must be apart along a face."""
+NARROW = 12
+"""Pairs of one kind (object-object, object-gripper) tested for edges; others must be apart along a face."""
 APART = 1.0
 """Distance reported where there is no contact."""
 LEFT_OUT = 0.0
-"""Distance reported for a pair that overlaps along all faces but was not among the NARROW: not a contact, but a fault."""
+"""Distance reported for a pair that overlaps along all faces but was not among the NARROW: no contact, but a fault."""
 PREFER_FACE = 5e-5
 """Metres by which two edges must be less deep than two faces to be the contact: faces give steady rest."""
 PARALLEL = 1e-6
@@ -68,7 +68,7 @@ def _faces() -> np.ndarray:
 
 
 def _edges() -> tuple[np.ndarray, np.ndarray]:
-    """Ends of each edge and the two faces beside it, both `[C, P, 3K, 2]`; edges of a repeated corner have no length."""
+    """Ends of each edge and the two faces beside it, both `[C, P, 3K, 2]`; a repeated corner's have no length."""
     i = np.arange(CORNERS)
     last = CORNERS_USED[..., None] - 1  # the last distinct corner
     after = np.broadcast_to((i + 1) % CORNERS, SIDES.shape)

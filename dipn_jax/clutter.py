@@ -1,0 +1,64 @@
+"""key -> scenes at rest, and what the camera sees of many scenes. Data generation and evaluation both begin here."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import primitives, records, render, scenes
+from dipn_jax.physics import Engine
+from dipn_jax.structs import Array, Fault, Observation, Scene, SettledScene
+
+BATCH = 64
+"""Scenes that compiled functions take at a time."""
+
+
+def settled(
+    key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int
+) -> tuple[SettledScene, dict[str, int]]:
+    """Drop `count` random scenes and keep those that came to rest inside the workspace without a fault.
+
+    Args:
+      key: random key.
+      engine: physics.
+      config: distributions.
+      count: scenes dropped, at most BATCH.
+
+    Returns:
+      The scenes kept `[K]`, and how many were dropped and why others were not kept.
+    """
+    made = _random_scenes(jax.random.split(key, BATCH), config)
+    scene, poses = records.take(made, slice(0, count))
+    rollout = primitives.settle(engine, scene, poses)
+    fault = np.asarray(rollout.fault)
+    everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)
+    counts = {f"settle_{name}": n for name, n in Fault.count(fault).items()}
+    return records.take(everything, fault == 0), {"dropped_scenes": count, **counts}
+
+
+def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
+    """`count` scenes at rest, however many drops it takes."""
+    kept: list[SettledScene] = []
+    while (missing := count - sum(len(batch.fault) for batch in kept)) > 0:
+        key, drop = jax.random.split(key)
+        batch, _ = settled(drop, engine, config, min(BATCH, int(1.2 * missing) + 2))
+        kept.append(records.take(batch, slice(0, missing)))
+    return records.concatenate(kept)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _random_scenes(keys: jax.Array, config: scenes.SceneConfig) -> tuple[Scene, jax.Array]:
+    return jax.vmap(lambda k: scenes.random_scene(k, config=config))(keys)
+
+
+def observe(scene: Scene, poses: Array) -> Observation:
+    """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
+    return _observe(jax.tree.map(jnp.asarray, scene), jnp.asarray(poses))
+
+
+@jax.jit
+def _observe(scene: Scene, poses: jax.Array) -> Observation:
+    return jax.lax.map(lambda pair: render.render(*pair), (scene, poses))

@@ -1,0 +1,277 @@
+"""Clear tables with Alg. 2, many instances in lockstep, to the end rules of the paper."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from dipn_jax import candidates, clutter, console, planner, policy, primitives, records, render, scenes
+from dipn_jax.errors import UserError
+from dipn_jax.physics import Engine
+from dipn_jax.structs import Decision, Observation, Push, Scene
+from dipn_jax.workspace import WORKSPACE
+from eval import metrics
+
+ACTIONS_PER_OBJECT = 3
+"""Source: the paper; more actions than that is a failure."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ClearConfig:
+    """How to decide."""
+
+    method: str = "dipn+gn"  # or gn: grasps only
+    candidates: int = 32
+    distance: float = 0.10  # metres a push goes, and is predicted for
+    gamma: float = 0.9
+    threshold: float = 0.7
+
+
+@dataclasses.dataclass
+class Instance:
+    """One table being cleared."""
+
+    name: str
+    scene: Scene  # numpy, [N]
+    poses: np.ndarray  # [N, 7]
+    objects: int
+    grasps: int = 0
+    pushes: int = 0
+    removed: int = 0
+    ended: str = ""  # cleared, pushed out, out of actions, fault
+    film: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+
+    @property
+    def actions(self) -> int:
+        return self.grasps + self.pushes
+
+
+def hard_instances(
+    engine: Engine, path: pathlib.Path, names: list[str] | None, *, slots: int, repeats: int, seed: int
+) -> list[Instance]:
+    """The cases of a file, settled; `repeats` of each, all but the first moved by up to 2 mm and reweighed.
+
+    Raises:
+      UserError: a name is not in the file.
+    """
+    found, scene, poses = scenes.load_cases(path, slots=slots)
+    wanted = names or found
+    missing = [name for name in wanted if name not in found]
+    if missing:
+        raise UserError(f"cases {missing}: not in {path}; it has {found}")
+    index = np.array([found.index(name) for name in wanted for _ in range(repeats)])
+    scene, poses = records.take(scene, index), poses[index].copy()
+    rng = np.random.default_rng(seed)
+    varied = np.arange(len(index)) % repeats > 0
+    poses[varied, :, :2] += rng.uniform(-0.002, 0.002, poses[varied, :, :2].shape)
+    factor = np.where(varied[:, None], rng.uniform(0.8, 1.2, scene.mass.shape), 1.0)
+    rub = np.where(varied[:, None], rng.uniform(0.85, 1.15, scene.mass.shape), 1.0)
+    scene = scene.replace(
+        mass=(scene.mass * factor).astype(np.float32), friction=(scene.friction * rub).astype(np.float32)
+    )
+    rollout = primitives.settle(engine, scene, poses)
+    return _instances([found[i] for i in index], scene, np.asarray(rollout.poses)[:, -1])
+
+
+def random_instances(engine: Engine, config: scenes.SceneConfig, *, count: int, seed: int) -> list[Instance]:
+    """`count` random settled scenes."""
+    items = clutter.settled_exactly(jax.random.key(seed), engine, config, count)
+    return _instances([f"random-{i}" for i in range(count)], items.scene, items.poses)
+
+
+def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instance]:
+    return [
+        Instance(name, records.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
+        for i, name in enumerate(names)
+    ]
+
+
+def clear(
+    instances: list[Instance],
+    engine: Engine,
+    predictor: planner.Predictor,
+    scorer: planner.Scorer,
+    config: ClearConfig,
+    *,
+    seed: int,
+) -> None:
+    """Act on every instance until all have ended; results are left in the instances.
+
+    Args:
+      instances: settled tables; changed in place.
+      engine: physics.
+      predictor: where everything goes.
+      scorer: which grasps hold.
+      config: the rule.
+      seed: of the push candidates.
+    """
+    if config.method not in ("dipn+gn", "gn"):
+        raise UserError(f"--method {config.method}: want dipn+gn or gn")
+    key = jax.random.key(seed)
+    total = sum(instance.objects for instance in instances)
+    with console.Progress("clear", total, unit="objects") as progress:
+        while active := [instance for instance in instances if not instance.ended]:
+            before = sum(instance.removed for instance in instances)
+            key, step = jax.random.split(key)
+            decisions = [
+                _decide(jax.random.fold_in(step, i), instance, predictor, scorer, config)
+                for i, instance in enumerate(active)
+            ]
+            pushing = [(a, s, d) for a, (s, d) in zip(active, decisions, strict=True) if bool(d.is_push)]
+            grasping = [(a, s, d) for a, (s, d) in zip(active, decisions, strict=True) if not bool(d.is_push)]
+            if pushing:
+                _push(pushing, engine)
+            if grasping:
+                _grasp(grasping, engine)
+            for instance in active:
+                instance.ended = _ended(instance)
+            removed = sum(instance.removed for instance in instances) - before
+            done = len(instances) - sum(not instance.ended for instance in instances)
+            progress.advance(removed, f"{done}/{len(instances)} tables ended")
+
+
+def _decide(
+    key: jax.Array, instance: Instance, predictor: planner.Predictor, scorer: planner.Scorer, config: ClearConfig
+) -> tuple[Observation, Decision]:
+    seen = render.render(instance.scene, instance.poses)
+    decision = planner.decide(
+        key,
+        seen,
+        predictor,
+        scorer,
+        count=config.candidates,
+        slots=len(instance.scene.shape),
+        distance=config.distance,
+        gamma=config.gamma,
+        threshold=config.threshold if config.method == "dipn+gn" else -1.0,
+    )
+    return seen, jax.device_get(decision)
+
+
+Acting = list[tuple[Instance, Observation, Decision]]
+
+
+def _stack(rows: Acting) -> tuple[Scene, np.ndarray]:
+    scene = jax.tree.map(lambda *leaves: np.stack(leaves), *[instance.scene for instance, _, _ in rows])
+    return scene, np.stack([instance.poses for instance, _, _ in rows])
+
+
+def _push(rows: Acting, engine: Engine) -> None:
+    scene, poses = _stack(rows)
+    pushes: Push = jax.tree.map(lambda *leaves: np.stack(leaves), *[decision.push for _, _, decision in rows])
+    rollout = primitives.push(engine, scene, poses, pushes)
+    for i, (instance, seen, decision) in enumerate(rows):
+        instance.pushes += 1
+        instance.poses = np.asarray(rollout.poses)[i, -1]
+        _remember(instance, seen, decision, "push")
+
+
+def _grasp(rows: Acting, engine: Engine) -> None:
+    scene, poses = _stack(rows)
+    taken = [candidates.grasp_at(decision.grasp_pixel, seen.height) for _, seen, decision in rows]
+    grasps = jax.tree.map(lambda *leaves: np.stack(leaves), *taken)
+    rollout, outcome = primitives.grasp(engine, scene, poses, grasps)
+    held, after = np.asarray(outcome.held), np.asarray(rollout.poses)[:, -1]
+    scene, after = jax.device_get(scenes.remove(scene, after, held))
+    rested = np.asarray(primitives.settle(engine, scene, after, duration=primitives.RESETTLE_TIME).poses)[:, -1]
+    for i, (instance, seen, decision) in enumerate(rows):
+        instance.grasps += 1
+        instance.removed += int(held[i].sum())
+        instance.scene, instance.poses = records.take(scene, i), rested[i]
+        _remember(instance, seen, decision, "grasp held" if held[i].any() else "grasp missed")
+
+
+def _remember(instance: Instance, seen: Observation, decision: Decision, what: str) -> None:
+    after = render.render(instance.scene, instance.poses)
+    push = decision.push
+    instance.film.append(
+        {
+            "what": what,
+            "before": _bytes(seen.color),
+            "predicted": _bytes(decision.predicted[..., :3]),
+            "after": _bytes(after.color),
+            "push": np.array([*push.start, push.angle, push.distance], np.float32),
+            "grasp": np.asarray(decision.grasp_pixel),
+            "values": np.array([decision.grasp_score, decision.value_now, decision.value_push], np.float32),
+        }
+    )
+
+
+def _bytes(color: Any) -> np.ndarray:
+    return np.round(np.clip(np.asarray(color), 0, 1) * 255).astype(np.uint8)
+
+
+def _ended(instance: Instance) -> str:
+    present = instance.scene.shape >= 0
+    if not np.isfinite(instance.poses).all():
+        return "fault"
+    if (np.abs(instance.poses[present, :2]) > WORKSPACE.half).any():
+        return "pushed out"
+    if not present.any():
+        return "cleared"
+    return "out of actions" if instance.actions >= ACTIONS_PER_OBJECT * instance.objects else ""
+
+
+def summary(instances: list[Instance]) -> dict[str, Any]:
+    """Flat metrics, each with a bootstrap 95 % interval over instances (`_low`, `_high`)."""
+    done = np.array([instance.ended == "cleared" for instance in instances])
+    removed = np.array([instance.removed for instance in instances])
+    held = np.array([sum(step["what"] == "grasp held" for step in instance.film) for instance in instances])
+    grasps = np.array([instance.grasps for instance in instances])
+    actions = np.array([instance.actions for instance in instances])
+    rows = {
+        "completion": (done, np.ones(len(done))),
+        "grasp_success_all": (held, grasps),
+        "grasp_success_completed": (held * done, grasps * done),
+        "efficiency_all": (removed, actions),
+        "efficiency_completed": (removed * done, actions * done),
+    }
+    result: dict[str, Any] = {}
+    for name, (hits, trials) in rows.items():
+        value, low, high = metrics.ratio_interval(hits, trials)
+        result |= {name: value, f"{name}_low": low, f"{name}_high": high}
+    result |= {"instances": len(instances), "grasps": int(grasps.sum()), "pushes": int((actions - grasps).sum())}
+    for reason in ("cleared", "pushed out", "out of actions", "fault"):
+        result[f"ended_{reason.replace(' ', '_')}"] = sum(instance.ended == reason for instance in instances)
+    return result
+
+
+def save(instances: list[Instance], out: pathlib.Path) -> None:
+    """Every step of every instance, as `episodes/NAME.npz` and a line of `episodes.jsonl`."""
+    lines = []
+    for number, instance in enumerate(instances):
+        stem = f"{number:03d}-{instance.name}"
+        (out / "episodes").mkdir(parents=True, exist_ok=True)
+        arrays: dict[str, Any] = {
+            key: np.stack([step[key] for step in instance.film]) for key in instance.film[0] if key != "what"
+        }
+        np.savez_compressed(out / "episodes" / f"{stem}.npz", what=[s["what"] for s in instance.film], **arrays)
+        lines.append(
+            {
+                "name": instance.name,
+                "file": f"episodes/{stem}.npz",
+                "ended": instance.ended,
+                "objects": instance.objects,
+                "removed": instance.removed,
+                "grasps": instance.grasps,
+                "pushes": instance.pushes,
+            }
+        )
+    records.write_json(out / "episodes.json", lines)
+
+
+def load_policies(config: ClearConfig, push_net: pathlib.Path | None, grasp_net: pathlib.Path, slots: int) -> Any:
+    """Predictor and scorer for a method.
+
+    Raises:
+      UserError: the method needs a push network and none was given.
+    """
+    if config.method == "gn":
+        return policy.static_predictor(slots), policy.load_scorer(grasp_net)
+    if push_net is None:
+        raise UserError(f"--method {config.method}: wants --push-net; give a run of dipn-train push")
+    return policy.load_predictor(push_net, slots), policy.load_scorer(grasp_net)

@@ -1,0 +1,172 @@
+"""`dipn-eval`: prediction, grasp, clear, report."""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from dipn_jax import console, scenes
+from dipn_jax.physics import EngineName, make_engine
+from eval import clearing, grasping, metrics, prediction
+from eval import report as reporting
+
+Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
+
+
+def _finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any]) -> None:
+    metrics.write(out, values, settings={k: str(v) if isinstance(v, pathlib.Path) else v for k, v in settings.items()})
+    for name, value in values.items():
+        console.say(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")
+
+
+def predict(
+    push_net: pathlib.Path,
+    out: pathlib.Path,
+    scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 300,
+    objects: Objects = "1:7",
+    seed: int = 1_000_000,
+    engine: EngineName = "native",
+    physics: bool = True,
+) -> None:
+    """Error of the predicted masks after 5 and 10 cm of a push, on scenes never trained on.
+
+      dipn-eval prediction --push-net runs/dipn --out results/prediction
+
+    Args:
+      push_net: run of dipn-train push.
+      out: folder for metrics.json and pictures.
+      scenes_: how many pushes, one a scene.
+      objects: number of objects in a scene.
+      seed: of scenes and pushes; keep it away from the training data's.
+      engine: what truth is.
+      physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
+    """
+    settings = dict(locals())
+    console.require_positive(scenes=scenes_)
+    values, films = prediction.evaluate(
+        push_net, make_engine(engine), scenes.parse_objects(objects), scenes=scenes_, seed=seed, physics=physics
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(out / "films.npz", **films)  # type: ignore[arg-type]
+    _finish(out, values, settings)
+
+
+def grasp(
+    grasp_net: pathlib.Path,
+    out: pathlib.Path,
+    scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 100,
+    objects: Objects = "10",
+    seed: int = 1_000_000,
+    engine: EngineName = "native",
+) -> None:
+    """Success of the best-scored grasp, beside that of a random foreground pixel at a random angle.
+
+      dipn-eval grasp --grasp-net runs/gn --out results/grasp
+
+    Args:
+      grasp_net: run of dipn-train grasp.
+      out: folder for metrics.json.
+      scenes_: how many scenes, one grasp of each kind on each.
+      objects: number of objects in a scene.
+      seed: of scenes and random grasps; keep it away from the training data's.
+      engine: physics.
+    """
+    settings = dict(locals())
+    console.require_positive(scenes=scenes_)
+    config = scenes.parse_objects(objects)
+    _finish(out, grasping.evaluate(grasp_net, make_engine(engine), config, scenes=scenes_, seed=seed), settings)
+
+
+def clear(
+    grasp_net: pathlib.Path,
+    out: pathlib.Path,
+    push_net: pathlib.Path | None = None,
+    method: Literal["dipn+gn", "gn"] = "dipn+gn",
+    cases: str = "hard",
+    names: tuple[str, ...] = (),
+    objects: Objects = "10",
+    instances: int = 1,
+    candidates: int = 32,
+    distance: float = 0.10,
+    gamma: float = 0.9,
+    threshold: float = 0.7,
+    seed: int = 1_000_000,
+    engine: EngineName = "native",
+) -> None:
+    """Clear tables with Alg. 2: push or grasp, until nothing is left.
+
+      dipn-eval clear --push-net runs/dipn --grasp-net runs/gn --cases hard --out results/hard
+      dipn-eval clear --push-net runs/dipn --grasp-net runs/gn --cases random --instances 30 --out results/random
+
+    Args:
+      grasp_net: run of dipn-train grasp.
+      out: folder for metrics.json and every step of every table.
+      push_net: run of dipn-train push.
+      method: dipn+gn, or gn: grasps only.
+      cases: hard (the ten hand-placed instances), random, or a case file of your own.
+      names: only these cases of the file.
+      objects: number of objects (random).
+      instances: tables (random), or repeats of each case with perturbed physics.
+      candidates: pushes considered at a time.
+      distance: metres of a push.
+      gamma: discount of a push's value.
+      threshold: grasp at once above this score.
+      seed: of scenes, perturbations and candidates.
+      engine: physics.
+    """
+    settings = dict(locals())
+    console.require_positive(instances=instances, candidates=candidates, distance=distance)
+    physics = make_engine(engine)
+    config = clearing.ClearConfig(method, candidates, distance, gamma, threshold)
+    if cases == "random":
+        scene_config = scenes.parse_objects(objects)
+        slots = scene_config.slots
+    else:
+        path = scenes.hard_cases_path() if cases == "hard" else pathlib.Path(cases)
+        slots = scenes.load_cases(path)[1].shape.shape[1]
+    predictor, scorer = clearing.load_policies(config, push_net, grasp_net, slots)
+    if cases == "random":
+        tables = clearing.random_instances(physics, scene_config, count=instances, seed=seed)
+    else:
+        tables = clearing.hard_instances(physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed)
+    clearing.clear(tables, physics, predictor, scorer, config, seed=seed)
+    clearing.save(tables, out)
+    _finish(out, clearing.summary(tables), settings)
+
+
+def report(
+    out: pathlib.Path,
+    predictions: Annotated[pathlib.Path | None, tyro.conf.arg(name="prediction")] = None,
+    grasps: Annotated[pathlib.Path | None, tyro.conf.arg(name="grasp")] = None,
+    hard: pathlib.Path | None = None,
+    random: pathlib.Path | None = None,
+    runs: tuple[pathlib.Path, ...] = (),
+) -> None:
+    """One self-contained report.html from the folders of other commands, and their numbers in one metrics.json.
+
+      dipn-eval report --prediction results/prediction --hard results/hard --runs runs/dipn runs/gn --out results
+
+    Args:
+      out: folder for report.html and metrics.json.
+      predictions: --out of dipn-eval prediction.
+      grasps: --out of dipn-eval grasp.
+      hard: --out of dipn-eval clear --cases hard.
+      random: --out of dipn-eval clear --cases random.
+      runs: training runs, for their learning curves.
+    """
+    values = reporting.write(out, prediction=predictions, grasp=grasps, hard=hard, random=random, runs=list(runs))
+    console.say(f"{out / 'report.html'}: {len(values)} numbers, also in {out / 'metrics.json'}")
+
+
+def main() -> None:
+    """Entry point."""
+    commands = {"prediction": predict, "grasp": grasp, "clear": clear, "report": report}
+    sys.exit(console.run("Measure predictors, grasps and whole policies; write the report.", commands))
+
+
+if __name__ == "__main__":
+    main()

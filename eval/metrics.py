@@ -1,0 +1,53 @@
+"""Numbers: intervals and the flat `metrics.json` of every evaluation."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from dipn_jax import records
+from dipn_jax.errors import UserError
+
+RESAMPLES = 2000
+
+
+def ratio_interval(hits: np.ndarray, trials: np.ndarray, *, seed: int = 0) -> tuple[float, float, float]:
+    """sum(hits) / sum(trials) over instances, with a bootstrap 95 % interval over instances.
+
+    Args:
+      hits: `[I]` per instance.
+      trials: `[I]` per instance.
+      seed: of the resampling.
+
+    Returns:
+      Estimate, low, high; NaN where there is no trial.
+    """
+    hits, trials = np.asarray(hits, float), np.asarray(trials, float)
+    if trials.sum() == 0:
+        return float("nan"), float("nan"), float("nan")
+    pick = np.random.default_rng(seed).integers(0, len(hits), (RESAMPLES, len(hits)))
+    total = trials[pick].sum(-1)
+    values = hits[pick].sum(-1)[total > 0] / total[total > 0]
+    low, high = np.quantile(values, [0.025, 0.975])
+    return float(hits.sum() / trials.sum()), float(low), float(high)
+
+
+def write(out: pathlib.Path, values: dict[str, Any], *, settings: dict[str, Any]) -> None:
+    """Write `metrics.json` (flat keys) and `settings.json` (what was asked for, versions) to `out`."""
+    records.write_json(out / "settings.json", {**settings, "versions": records.package_versions()})
+    records.write_json(out / "metrics.json", values)
+
+
+def read(folder: pathlib.Path) -> dict[str, Any]:
+    """The flat metrics of an evaluation.
+
+    Raises:
+      UserError: there are none.
+    """
+    try:
+        return json.loads((folder / "metrics.json").read_text())
+    except (OSError, json.JSONDecodeError):
+        raise UserError(f"{folder}: no readable metrics.json; give the --out of a dipn-eval command") from None

@@ -1,0 +1,198 @@
+"""The training loop, top to bottom; what is trained arrives as a `Task`."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import pathlib
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import grain
+import jax
+import numpy as np
+import optax
+import tensorboardX
+from flax import nnx
+
+from dipn_jax import checkpoint, console, records
+from dipn_jax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How to train."""
+
+    steps: int = 2000
+    batch: int = 32
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    optimizer: str = "adamw"  # cosine decay; or sgd: momentum 0.9, constant rate, as published
+    seed: int = 0
+    eval_every: int = 200
+    save_every: int = 200
+
+
+class Task(Protocol):
+    """Something to learn: data, a loss and a measure."""
+
+    network: str  # key of checkpoint.NETWORKS
+    network_config: Any
+    size: int  # training examples
+    fingerprint: str  # of the data
+
+    def fetch(self, index: np.ndarray) -> Any:
+        """The raw examples `index [B]`, on the host."""
+        ...
+
+    def loss(self, model: nnx.Module, batch: Any, key: jax.Array) -> jax.Array:
+        """Loss of a raw batch; renders what the network sees, inside jit."""
+        ...
+
+    def evaluate(self, model: nnx.Module) -> dict[str, float]:
+        """Measures on examples that are not trained on."""
+        ...
+
+
+def _optimizer(config: TrainConfig) -> optax.GradientTransformation:
+    if config.optimizer == "sgd":
+        return optax.chain(
+            optax.add_decayed_weights(config.weight_decay), optax.sgd(config.learning_rate, momentum=0.9)
+        )
+    if config.optimizer == "adamw":
+        warm = min(100, config.steps // 10 + 1)
+        rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warm, max(config.steps, warm + 1))
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=config.weight_decay))
+    raise UserError(f"--optimizer {config.optimizer}: want adamw or sgd")
+
+
+def _split(model: nnx.Module) -> tuple[Any, Any, Any]:
+    """Graph, parameters, everything else (statistics, random streams)."""
+    parts: Any = nnx.split(model, nnx.Param, ...)
+    return parts
+
+
+def _make_step(task: Task, graph: Any, optimizer: optax.GradientTransformation) -> Callable[..., Any]:
+    @functools.partial(jax.jit, donate_argnums=(0, 1, 2))
+    def step(params: Any, rest: Any, moments: Any, batch: Any, key: jax.Array) -> Any:
+        def loss(p: Any) -> tuple[jax.Array, Any]:
+            model = nnx.merge(graph, p, rest)
+            model.train()
+            value = task.loss(model, batch, key)
+            return value, _split(model)[2]
+
+        (value, new_rest), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+        updates, moments = optimizer.update(gradient, moments, params)
+        return optax.apply_updates(params, updates), new_rest, moments, value
+
+    return step
+
+
+def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Module | None = None) -> dict[str, float]:
+    """Train, or go on training, in the folder `out`.
+
+    Args:
+      task: what to learn.
+      config: how.
+      out: run folder: `config.json`, `metrics.jsonl`, `events/` (TensorBoard), `checkpoints/`.
+      initial: network to start from; a fresh one if not given.
+
+    Returns:
+      The last evaluation.
+
+    Raises:
+      UserError: the folder holds a run of another config or on other data.
+    """
+    console.require_positive(steps=config.steps, batch=config.batch, learning_rate=config.learning_rate)
+    identity = _claim(task, config, out)
+    model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
+    graph, params, rest = _split(model)
+    optimizer = _optimizer(config)
+    moments, begin = optimizer.init(params), 0
+    found = checkpoint.newest(out)
+    if found:
+        folder, meta = found
+        begin = int(meta["step"])
+        nnx.update(model, checkpoint.restore(folder, "model", nnx.state(model)))
+        graph, params, rest = _split(model)
+        moments = checkpoint.restore(folder, "train", moments)
+    order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
+    step_fn = _make_step(task, graph, optimizer)
+    log = _Log(out, begin)
+    key = jax.random.key(config.seed)
+    latest: dict[str, float] = {}
+
+    def save(step: int) -> None:
+        parts = {"model": nnx.state(nnx.merge(graph, params, rest)), "train": moments}
+        checkpoint.save(
+            out, step, parts, network=task.network, config=task.network_config, extra={"run": identity, **latest}
+        )
+
+    step = begin
+    with console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin) as progress:
+        try:
+            while step < config.steps:
+                batch = task.fetch(np.asarray(order[step]))
+                params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
+                step += 1
+                if step % config.eval_every == 0 or step == config.steps:
+                    model = nnx.merge(graph, params, rest)
+                    model.eval()
+                    latest = {"loss": float(loss), **task.evaluate(model)}
+                    log.write(step, latest)
+                if step % config.save_every == 0 or step == config.steps:
+                    save(step)
+                progress.advance(1, " ".join(f"{k} {v:.3f}" for k, v in latest.items()))
+        except KeyboardInterrupt:
+            jax.block_until_ready(params)
+            save(step)
+            raise
+    log.close()
+    return latest or log.last()
+
+
+def _claim(task: Task, config: TrainConfig, out: pathlib.Path) -> dict[str, Any]:
+    """Write the run's config, or check that it is the one that the folder was begun with."""
+    identity = {
+        "network": task.network,
+        "network_config": dataclasses.asdict(task.network_config),
+        "train": dataclasses.asdict(config),
+        "data": task.fingerprint,
+    }
+    identity = json.loads(json.dumps(identity))
+    path = out / "config.json"
+    if path.exists():
+        theirs = json.loads(path.read_text())
+        different = [k for k in identity if theirs.get(k) != identity[k]]
+        if different:
+            raise UserError(
+                f"{out}: holds a run with another {different[0]} ({theirs.get(different[0])}); "
+                "give another --out, or the same options and data to go on"
+            )
+    records.write_json(path, identity)
+    return identity
+
+
+class _Log:
+    """`metrics.jsonl` and TensorBoard events; lines past the restored step are dropped."""
+
+    def __init__(self, out: pathlib.Path, begin: int) -> None:
+        self.path = out / "metrics.jsonl"
+        old = self.path.read_text().splitlines() if self.path.exists() else []
+        kept = [line for line in old if json.loads(line)["step"] <= begin]
+        records.write_atomically(self.path, "".join(line + "\n" for line in kept).encode())
+        self.events = tensorboardX.SummaryWriter(str(out / "events"), purge_step=begin)
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        with self.path.open("a") as stream:
+            stream.write(json.dumps({"step": step, **values}) + "\n")
+        for name, value in values.items():
+            self.events.add_scalar(name, value, step)
+
+    def last(self) -> dict[str, float]:
+        lines = self.path.read_text().splitlines()
+        return json.loads(lines[-1]) if lines else {}
+
+    def close(self) -> None:
+        self.events.close()

@@ -1,0 +1,116 @@
+"""DIPN's task: motions of every object at any recorded distance of a push."""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from dipn_jax import geometry, losses, records, render
+from dipn_jax.errors import UserError
+from dipn_jax.networks import dipn
+from dipn_jax.structs import PushEpisode
+from dipn_jax.workspace import PUSH_STEPS
+
+
+class PushTask:
+    """Episodes in, motions out. A tenth of the episodes, the last ones, is held out for the learning curve."""
+
+    network = "dipn"
+
+    def __init__(
+        self, data: pathlib.Path, config: dipn.DipnConfig, *, limit: int | None, centimetres: tuple[int, ...]
+    ) -> None:
+        """Load a data set.
+
+        Args:
+          data: folder of push episodes.
+          config: architecture.
+          limit: use only the first so many episodes.
+          centimetres: distances learnt, each 1 to 10.
+        """
+        if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
+            raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
+        episodes, fingerprint = records.load(data, kind="push")
+        count = len(episodes.fault)
+        if limit is not None and limit > count:
+            raise UserError(f"--limit {limit}: {data} has {count} episodes; generate more or ask for fewer")
+        count = limit or count
+        held_out = max(1, count // 10)
+        if count - held_out < 1:
+            raise UserError(f"data set {data}: {count} episodes; want at least 2")
+        self.train_set = records.take(episodes, slice(0, count - held_out))
+        self.test_set = records.take(episodes, slice(count - held_out, count))
+        self.network_config = config
+        self.size = count - held_out
+        self.fingerprint = f"{fingerprint}:{count}:{centimetres}"
+        self.centimetres = np.array(centimetres, np.int32)
+        self.slots = episodes.scene.shape.shape[1]
+
+    def fetch(self, index: np.ndarray) -> PushEpisode:
+        """See `loop.Task`."""
+        return records.take(self.train_set, index)
+
+    def prepare(self, episodes: PushEpisode, centimetres: jax.Array) -> tuple[dipn.PushInput, jax.Array]:
+        """Inputs `[B]` and targets `[B, N, 3]` (pixels, degrees, push frame) at `centimetres [B]`."""
+        return jax.vmap(functools.partial(example, slots=self.slots, stride=self.network_config.stride))(
+            episodes, centimetres
+        )
+
+    def loss(self, model: nnx.Module, batch: PushEpisode, key: jax.Array) -> jax.Array:
+        """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored."""
+        count = batch.fault.shape[0]
+        distance_key, mirror_key = jax.random.split(key)
+        chosen = jnp.asarray(self.centimetres)[jax.random.randint(distance_key, (count,), 0, len(self.centimetres))]
+        inputs, target = self.prepare(batch, chosen)
+        flipped = jax.random.bernoulli(mirror_key, 0.5, (count,))
+
+        def pick(mirrored: jax.Array, seen: jax.Array) -> jax.Array:
+            return jnp.where(flipped.reshape(-1, *[1] * (seen.ndim - 1)), mirrored, seen)
+
+        inputs = jax.tree.map(pick, dipn.mirror(inputs), inputs)
+        target = pick(target * jnp.array([1.0, -1.0, -1.0]), target)
+        return losses.motion_loss(model(inputs), target, inputs.present)
+
+    def evaluate(self, model: nnx.Module) -> dict[str, float]:
+        """See `loop.Task`: loss, and position error of moved objects (mm), at the largest distance."""
+        total: dict[str, list[Any]] = {"held_out_loss": [], "moved_error_mm": []}
+        graph, state = nnx.split(model)
+        size = 32
+        for begin in range(0, len(self.test_set.fault), size):
+            index = np.arange(begin, begin + size) % len(self.test_set.fault)
+            weight = np.arange(begin, begin + size) < len(self.test_set.fault)
+            episodes = records.take(self.test_set, index)
+            loss, error, moved = self._measure(graph, state, episodes, jnp.asarray(weight))
+            total["held_out_loss"].append((float(loss), int(weight.sum())))
+            total["moved_error_mm"].append((float(error), float(moved)))
+        return {name: sum(v * w for v, w in rows) / max(sum(w for _, w in rows), 1e-9) for name, rows in total.items()}
+
+    @functools.partial(jax.jit, static_argnums=(0, 1))
+    def _measure(self, graph: Any, state: Any, episodes: PushEpisode, weight: jax.Array) -> tuple[jax.Array, ...]:
+        model = nnx.merge(graph, state)
+        distance = jnp.full(weight.shape, int(self.centimetres.max()))
+        inputs, target = self.prepare(episodes, distance)
+        predicted = model(inputs)
+        counted = inputs.present & weight[:, None]
+        loss = losses.motion_loss(predicted, target, counted)
+        moved = losses.moved(target / losses.PIXELS_DEGREES) & counted
+        error = jnp.linalg.norm((predicted - target)[..., :2], axis=-1) / losses.PIXELS_DEGREES[0] * 1000
+        return loss, (error * moved).sum() / jnp.maximum(moved.sum(), 1), moved.sum()
+
+
+def example(
+    episode: PushEpisode, centimetres: jax.Array, *, slots: int, stride: int
+) -> tuple[dipn.PushInput, jax.Array]:
+    """One episode as input and target `[N, 3]` (pixels, degrees, push frame) after `centimetres []`."""
+    before, after = episode.poses[0], episode.poses[centimetres]
+    _, label = render.render_depth(episode.scene, before)
+    push = episode.push.replace(distance=centimetres * 0.01)
+    inputs, centers = dipn.push_input(label, push, slots=slots, stride=stride)
+    motion = geometry.planar_motion(before, after, centers)
+    return inputs, dipn.from_workspace(motion, push.angle)
