@@ -32,7 +32,7 @@ class DipnConfig:
 
     preset: str = "compact"
     stages: tuple[int, ...] = (3, 4, 6, 3)  # paper: ResNet-50; the released code has (2, 2, 2, 2)
-    width: int = 24  # compact: channels of the first stage
+    width: int = 32  # compact: channels of the first stage
     map_stride: int = 2  # compact: the maps are sampled every so many pixels
 
     def __post_init__(self) -> None:
@@ -199,8 +199,8 @@ class _CompactEncoders(nnx.Module):
 
     def __init__(self, config: DipnConfig, rngs: nnx.Rngs) -> None:
         side = WORKSPACE.pixels // config.stride
-        self.scene = _CompactEncoder(2, 4, config.width, side, 128, rngs)
-        self.item = _CompactEncoder(3, 3, config.width + 8, CROP // config.stride, 128, rngs)
+        self.scene = _CompactEncoder(2, 8, config.width, side, 128, rngs)
+        self.item = _CompactEncoder(3, 3, config.width, CROP // config.stride, 128, rngs)
         self.sizes = (128, 128)
 
     def __call__(self, maps: jax.Array, crops: jax.Array) -> tuple[jax.Array, jax.Array]:

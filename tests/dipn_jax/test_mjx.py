@@ -24,8 +24,8 @@ POSITION_TOLERANCE = 0.003
 contact patch; measured 0.1-0.5 mm on these scenes and a median of 0.2 mm on 32 random ones."""
 DEPTH_TOLERANCE = 1e-4
 """Metres of contact depth; 0.05 mm of it is `prisms.PREFER_FACE`."""
-DEEPEST = 0.01
-"""Metres of depth up to which C's iterative algorithm is the reference; contacts here are a millimetre deep at most."""
+DEEPEST = 0.003
+"""Metres: deeper than any contact of an episode. Far deeper, clipping a face can cut off the deepest corner."""
 CLASS = {name: i for i, name in enumerate(shapes.CLASSES)}
 SIZES = {
     "cuboid": (0.06, 0.05, 0.04),
@@ -79,7 +79,7 @@ def settled(reference: NativeEngine) -> tuple[Scene, np.ndarray]:
 def pushed(engine: MjxEngine, settled: tuple[Scene, np.ndarray]) -> tuple[Push, Any]:
     """A push of the middle object along x, which grazes no other; also what compiles the program."""
     scene, poses = settled
-    start = jnp.asarray(poses[:, 1, :2] - np.array([0.08, 0.0]), jnp.float32)
+    start = jnp.asarray(poses[:, 1, :2] - np.array([0.055, 0.0]), jnp.float32)
     push = Push(start, jnp.zeros(BATCH), jnp.full(BATCH, 0.1))
     return push, primitives.push(engine, scene, poses, push)
 
@@ -158,7 +158,7 @@ def _random_pairs(count: int) -> tuple[Scene, np.ndarray]:
     quat = np.asarray(geometry.random_quat(keys[0], (count, 2)))
     direction = np.asarray(jax.random.normal(keys[1], (count, 3)))
     direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-    gap = np.asarray(jax.random.uniform(keys[2], (count, 1), minval=0.030, maxval=0.045))
+    gap = np.asarray(jax.random.uniform(keys[2], (count, 1), minval=0.035, maxval=0.055))
     position = np.stack([np.zeros((count, 3)), direction * gap], 1) + np.array([0.0, 0.0, 0.025])
     full = np.full(shape.shape, 0.35, np.float32)
     return Scene(shape, size, np.zeros_like(size), full, full), np.concatenate([position, quat], -1).astype(np.float32)
@@ -181,7 +181,7 @@ def _depths(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def test_contact_depths_agree_with_mujoco_c() -> None:
-    scene, poses = _random_pairs(50)
+    scene, poses = _random_pairs(100)
     found, table = (np.asarray(x) for x in _depths(scene, poses))
     touching, worst = 0, 0.0
     for b in range(len(poses)):
