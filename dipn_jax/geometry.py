@@ -43,7 +43,7 @@ def quat_about_z(angle: Array) -> Array:
     return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], -1)
 
 
-def random_quat(key: Array, shape: tuple[int, ...] = ()) -> Array:
+def random_quat(key: Array, *, shape: tuple[int, ...] = ()) -> Array:
     """Uniformly random rotations `[*shape, 4]` (wxyz)."""
     q = jax.random.normal(key, (*shape, 4))
     return q / jnp.linalg.norm(q, axis=-1, keepdims=True)

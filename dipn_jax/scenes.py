@@ -101,7 +101,7 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
     mass = density * jnp.asarray(shapes.UNIT_VOLUME, jnp.float32)[classes[item]] * size.prod(-1)
     friction = jax.random.uniform(keys[5], (n,), minval=config.friction[0], maxval=config.friction[1])
     xy = jax.random.uniform(keys[6], (n, 2), minval=-0.5, maxval=0.5) * config.spread
-    quat = geometry.random_quat(keys[7], (n,))
+    quat = geometry.random_quat(keys[7], shape=(n,))
     radius = shapes.radius(shape, size)
     z = _stack_heights(xy, radius, present)
     poses = jnp.concatenate([xy, z[:, None], quat], -1)

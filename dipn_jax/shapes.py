@@ -12,13 +12,14 @@ corners still roll where friction is above tan(15 deg) = 0.27.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax.structs import Pytree
+from dipn_jax.structs import Array, Pytree
 
 CLASSES = ("cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave")
 CORNERS = 12
@@ -216,3 +217,15 @@ def radius(shape: jax.Array, size: jax.Array) -> jax.Array:
     """Radius `[...]` (metres) of a ball about the centre of mass that holds the object."""
     offset = jnp.asarray(UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(shape, 0)] * size
     return jnp.linalg.norm(size, axis=-1) / 2 + jnp.linalg.norm(offset, axis=-1)
+
+
+def lowest_corner(shape: Array, size: Array, poses: Array, *, xp: Any = jnp) -> Array:
+    """Height `[...]` (metres) of the lowest corner of objects `shape [...]`, `size [..., 3]`, `poses [..., 7]`.
+
+    `xp` is `jax.numpy`, or `numpy` where the number of objects changes from call to call.
+    """
+    w, x, y, z = (poses[..., 3 + i] for i in range(4))
+    up = xp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1)
+    corners = xp.asarray(UNIT_VERTICES.reshape(len(CLASSES), -1, 3))[xp.maximum(shape, 0)]
+    # a missing part's corners are at the centre of mass, never the lowest
+    return poses[..., 2] + (corners * (size * up)[..., None, :]).sum(-1).min(-1)

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
 
-from dipn_jax import model, physics
+from dipn_jax import model, physics, shapes
 from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
 from dipn_jax.structs import Array, Fault, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER, WORKSPACE
@@ -37,7 +37,7 @@ class NativeEngine:
         models = self._compile(packed)
         sims = mujoco_batch.Batch(models[0], nsim=len(models), nthread=self.threads)
         sims.set_models(models)
-        watch = _Watch(packed.shape >= 0, packed.size, sims)
+        watch = _Watch(packed, sims)
         sims.qpos[:, GRIPPER_DOF:] = np.take_along_axis(poses, slots[..., None], 1).reshape(len(models), -1)
         sims.qpos[:, :GRIPPER_DOF] = _controls(trajectories, 0.0)
         ticks = np.round(instants / physics.CONTROL_PERIOD).astype(int)
@@ -73,12 +73,13 @@ class NativeEngine:
 class _Watch:
     """Collects faults while a batch runs."""
 
-    def __init__(self, present: np.ndarray, size: np.ndarray, sims: mujoco_batch.Batch) -> None:
-        self.present, self.radius = present, np.linalg.norm(size, axis=-1) / 2
+    def __init__(self, scenes: Scene, sims: mujoco_batch.Batch) -> None:
+        self.shape, self.size = scenes.shape, scenes.size
+        self.present, self.radius = scenes.shape >= 0, np.linalg.norm(scenes.size, axis=-1) / 2
         self.sims = sims
-        self.broken = np.zeros(len(present), bool)
-        self.top = np.zeros(len(present))
-        self.speed = np.zeros(present.shape)
+        self.broken = np.zeros(len(self.present), bool)
+        self.top = np.zeros(len(self.present))
+        self.speed = np.zeros(self.present.shape)
 
     def raised(self, ids: np.ndarray) -> None:
         self.broken[ids] = True
@@ -99,7 +100,8 @@ class _Watch:
         warning = np.asarray(sims.warning)[..., 1]  # (last info, count)
         position = np.array(sims.qpos[:, GRIPPER_DOF:]).reshape(*self.present.shape, 7)
         outside = (np.abs(position[..., :2]) > WORKSPACE.half).any(-1) & self.present
-        sunk = (position[..., 2] < -physics.MAX_SINK) & self.present
+        lowest = shapes.lowest_corner(self.shape, self.size, position, xp=np)
+        sunk = (lowest < -physics.MAX_SINK) & self.present
         short = np.abs(np.asarray(sims.qpos)[:, :3] - target[:, :3]).max(-1) > physics.MAX_SHORT
         code = np.zeros(len(position), np.int32)
         broken = self.broken | (warning[:, [int(w) for w in bad]] > 0).any(-1) | ~np.isfinite(position).all((1, 2))

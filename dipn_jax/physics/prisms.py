@@ -249,7 +249,9 @@ def convex_prism(first: ConvexInfo, second: ConvexInfo) -> Contacts:
     pos = jnp.where(edge, edge_pos, pos)
     alive = (first.size[0] > 0) & (second.size[0] > 0)
     frame = math.make_frame(jnp.where(edge, edge_axis, reference * normal))
-    return _merged(dist, pos, alive), pos + origin, jnp.broadcast_to(frame, (CONTACTS, 3, 3))
+    dist = _merged(dist, pos, alive)
+    pos = jnp.where((dist < 0)[:, None], pos, 0.0)  # elsewhere it may be huge, and MJX multiplies it by zero
+    return dist, pos + origin, jnp.broadcast_to(frame, (CONTACTS, 3, 3))
 
 
 def _gather(m: Any, d: Any, key: Any, geom: jax.Array) -> tuple[list[Any], list[Any]]:

@@ -1,0 +1,49 @@
+"""Shared by all tests: strict JAX, compiled functions and small data made once a session."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from datagen.generate import Job, generate
+from dipn_jax import clutter, console, scenes
+from dipn_jax.physics import make_engine
+
+console.enable_compilation_cache()
+
+SLOTS = 5
+
+
+@pytest.fixture(scope="session")
+def engine() -> Any:
+    """MuJoCo C."""
+    return make_engine("native")
+
+
+@pytest.fixture(scope="session")
+def settled(engine: Any) -> Any:
+    """Six scenes of five objects at rest, numpy."""
+    return clutter.settled_exactly(jax.random.key(7), engine, scenes.fixed_count(SLOTS), 6)
+
+
+def _job(kind: str, episodes: int, actions: int) -> Job:
+    return Job(kind, scenes.fixed_count(3, spread=0.2), episodes, 0, 16, actions, "native", 0.002)
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
+    """A tiny data set of each kind."""
+    root = tmp_path_factory.mktemp("data")
+    for kind, episodes, actions in (("push", 24, 4), ("grasp", 24, 4), ("images", 4, 1)):
+        generate(_job(kind, episodes, actions), root / kind)
+    return {kind: root / kind for kind in ("push", "grasp", "images")}
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A seeded generator."""
+    return np.random.default_rng(0)

@@ -1,0 +1,95 @@
+import dataclasses
+import json
+import pathlib
+import shutil
+
+import numpy as np
+import pytest
+
+from datagen.generate import Job, generate
+from dipn_jax import records, scenes
+from dipn_jax.errors import UserError
+
+JOB = Job("push", scenes.fixed_count(3, spread=0.2), 24, 0, 16, 4, "native", 0.002)
+
+
+@pytest.fixture
+def copy(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> pathlib.Path:
+    return pathlib.Path(shutil.copytree(data["push"], tmp_path / "push"))
+
+
+def test_push_episodes_are_pushes(data: dict[str, pathlib.Path]) -> None:
+    episodes, _ = records.load(data["push"], kind="push")
+    assert len(episodes.fault) == 24 and episodes.poses.shape == (24, 11, 3, 7)
+    shift = np.linalg.norm(episodes.poses[:, 10, :, :2] - episodes.poses[:, 0, :, :2], axis=-1)
+    assert (shift.max(-1) > 0.02).mean() > 0.8, "most pushes move something"
+    still = np.linalg.norm(episodes.poses[:, 1, :, :2] - episodes.poses[:, 0, :, :2], axis=-1)
+    assert still.max() < 0.01, "the first centimetre is free"
+
+
+def test_grasp_episodes_agree_with_their_outcome(data: dict[str, pathlib.Path]) -> None:
+    episodes, _ = records.load(data["grasp"], kind="grasp")
+    np.testing.assert_array_equal(episodes.success, episodes.held.any(-1))
+    rise = episodes.after[..., 2] - episodes.poses[..., 2]
+    assert (rise[episodes.held] > 0.075).all()
+    assert 0 < episodes.success.mean() < 1
+
+
+def test_a_shard_is_the_same_by_another_worker(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    other = tmp_path / "other"
+    generate(JOB, other, part=1, of=2)
+    assert sorted(p.name for p in other.glob("*.parquet")) == ["shard-00001.parquet"]
+    assert records.shard_path(other, 1).read_bytes() == records.shard_path(copy, 1).read_bytes()
+
+
+def test_a_gap_is_filled_with_the_same_bytes_and_the_rest_left_alone(copy: pathlib.Path) -> None:
+    first, second = records.shard_path(copy, 0), records.shard_path(copy, 1)
+    wanted, untouched = second.read_bytes(), first.stat().st_mtime_ns
+    second.unlink()
+    generate(JOB, copy)
+    assert second.read_bytes() == wanted
+    assert first.stat().st_mtime_ns == untouched
+    assert records.verify(copy) == []
+
+
+def test_an_interruption_loses_at_most_the_shard_at_hand(
+    copy: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "new"
+    original = records.write_shard
+
+    def die_at_second(folder: pathlib.Path, index: int, *args: object, **options: object) -> None:
+        if index == 1:
+            raise KeyboardInterrupt
+        original(folder, index, *args, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(records, "write_shard", die_at_second)
+    with pytest.raises(KeyboardInterrupt):
+        generate(JOB, out)
+    monkeypatch.undo()
+    assert records.verify(out) == []
+    generate(JOB, out)
+    for index in (0, 1):
+        assert records.shard_path(out, index).read_bytes() == records.shard_path(copy, index).read_bytes()
+
+
+def test_another_config_in_the_same_folder_is_refused(copy: pathlib.Path) -> None:
+    before = sorted((p.name, p.read_bytes()) for p in copy.iterdir())
+    with pytest.raises(UserError, match="seed=0, asked for seed=1"):
+        generate(dataclasses.replace(JOB, seed=1), copy)
+    assert sorted((p.name, p.read_bytes()) for p in copy.iterdir()) == before
+
+
+def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
+    generate(dataclasses.replace(JOB, episodes=32), copy)
+    assert len(records.load(copy, kind="push")[0].fault) == 32
+    assert json.loads((copy / "config.json").read_text())["episodes"] == 32
+
+
+def test_nonsense_is_refused(tmp_path: pathlib.Path) -> None:
+    for change in ({"episodes": -1}, {"shard_size": 0}, {"actions": 0}, {"timestep": -0.1}):
+        with pytest.raises(UserError, match="want a number above 0"):
+            generate(dataclasses.replace(JOB, **change), tmp_path / "x")
+    with pytest.raises(UserError, match="--shard 2 --of 2"):
+        generate(JOB, tmp_path / "x", part=2, of=2)
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,79 @@
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import candidates, geometry, records, render
+from dipn_jax.structs import ABSENT, Observation
+
+
+def _seen(settled: Any, index: int = 0) -> Observation:
+    return render.render(records.take(settled.scene, index), settled.poses[index])
+
+
+def test_contour_is_opencvs(settled: Any) -> None:
+    mask = np.asarray(_seen(settled).label) != ABSENT
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    np.testing.assert_array_equal(candidates.contour(jnp.array(mask)), mask & (eroded == 0))
+
+
+def test_centroids_are_opencvs(settled: Any) -> None:
+    label = np.asarray(_seen(settled).label)
+    centers, area = candidates.mask_centers(jnp.array(label), 5)
+    for i in range(5):
+        moments = cv2.moments((label == i).astype(np.uint8), binaryImage=True)
+        assert area[i] == moments["m00"]
+        want = np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1)
+        np.testing.assert_allclose(geometry.metres_to_pixels(centers[i]), want, atol=1e-2)
+
+
+def test_feasible_pushes_start_free_inside_and_aim_at_an_object(settled: Any) -> None:
+    seen = _seen(settled)
+    pushes, feasible = candidates.sample_pushes(jax.random.key(0), seen, count=16, slots=5, distance=0.1)
+    assert feasible[:4].all() and (np.diff(np.asarray(feasible).astype(int)) <= 0).all(), "feasible ones first"
+    pixel = np.asarray(geometry.metres_to_pixels(pushes.start))[feasible]
+    assert pixel.min() >= 10 and pixel.max() <= 214
+    height, label = np.asarray(seen.height), np.asarray(seen.label)
+    for col, row in np.round(pixel).astype(int):
+        assert height[row - 4 : row + 5, col - 4 : col + 5].max() < 0.01
+    direction = np.stack([np.cos(pushes.angle), np.sin(pushes.angle)], -1)[feasible]
+    contact = pixel + 15 * direction
+    near = [label[int(r) - 2 : int(r) + 3, int(c) - 2 : int(c) + 3].max() >= 0 for c, r in contact]
+    assert all(near), "15 pixels ahead of the start is an object"
+
+
+def test_other_key_other_pushes_same_key_same_pushes(settled: Any) -> None:
+    seen = _seen(settled)
+    draw = [candidates.sample_pushes(jax.random.key(k), seen, count=16, slots=5, distance=0.1)[0] for k in (0, 0, 1)]
+    np.testing.assert_array_equal(draw[0].start, draw[1].start)
+    assert not np.array_equal(draw[0].start, draw[2].start)
+
+
+def test_an_empty_table_has_no_feasible_push() -> None:
+    zero = jnp.zeros((224, 224))
+    seen = Observation(zero, jnp.zeros((224, 224, 3)), jnp.full((224, 224), ABSENT))
+    _, feasible = candidates.sample_pushes(jax.random.key(0), seen, count=16, slots=5, distance=0.1)
+    assert not feasible.any()
+
+
+def test_a_push_off_the_table_is_dropped() -> None:
+    centers, area = jnp.array([[0.15, 0.0], [0.0, 0.0]]), jnp.array([100.0, 100.0])
+    still = jnp.zeros((2, 3))
+    assert candidates.stays_inside(centers, area, still)
+    out = still.at[0, 0].set(0.02)  # twice that passes pixel 199, 0.175 m
+    assert not candidates.stays_inside(centers, area, out)
+    assert candidates.stays_inside(centers, area.at[0].set(0.0), out), "an object out of sight does not count"
+    assert candidates.stays_inside(centers.at[0, 0].set(0.2), area, out.at[0, 0].set(-0.01)), "moving inward is fine"
+
+
+def test_random_grasps_lie_on_objects_at_the_height_below_them(settled: Any) -> None:
+    seen = _seen(settled)
+    grasps = candidates.random_grasps(jax.random.key(0), seen, count=8)
+    pixel = np.round(np.asarray(geometry.metres_to_pixels(grasps.center))).astype(int)
+    height = np.asarray(seen.height)[pixel[:, 1], pixel[:, 0]]
+    assert (np.asarray(seen.label)[pixel[:, 1], pixel[:, 0]] >= 0).all()
+    np.testing.assert_allclose(grasps.height, np.maximum(height - 0.04, 0.02), atol=1e-6)
+    steps = np.asarray(grasps.angle) / (np.pi / 8)
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-4)

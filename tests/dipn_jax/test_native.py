@@ -1,0 +1,136 @@
+"""The C engine and the primitives on it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dipn_jax import physics, primitives, records, scenes, shapes
+from dipn_jax.errors import UserError
+from dipn_jax.physics import native
+from dipn_jax.structs import Fault, Grasp, Push, Scene
+
+
+def one_of_each(slots: int = 2) -> tuple[Scene, np.ndarray]:
+    """Five scenes, each one object of another class at rest in the middle, the other slots empty."""
+    count = len(shapes.CLASSES)
+    shape = np.full((count, slots), -1, np.int32)
+    shape[:, 0] = np.arange(count)
+    size = np.tile(np.array([0.05, 0.05, 0.05], np.float32), (count, slots, 1))
+    mass = np.full((count, slots), 0.05, np.float32)
+    scene = Scene(shape, size, np.zeros_like(size), mass, np.full((count, slots), 0.35, np.float32))
+    poses = np.tile(np.asarray(scenes.parked(slots)), (count, 1, 1))
+    poses[:, 0] = [0, 0, 0.03, 1, 0, 0, 0]
+    return scene, poses
+
+
+@pytest.fixture(scope="module")
+def resting(engine: Any) -> tuple[Scene, np.ndarray]:
+    scene, poses = one_of_each()
+    rollout = primitives.settle(engine, scene, poses)
+    assert not rollout.fault.any()
+    return scene, rollout.poses[:, -1]
+
+
+def _pushes(count: int, distance: float = 0.1) -> Push:
+    return Push(
+        np.tile([[-0.07, 0.0]], (count, 1)).astype(np.float32),
+        np.zeros(count, np.float32),
+        np.full(count, distance, np.float32),
+    )
+
+
+def test_every_class_comes_to_rest_on_the_table(resting: Any) -> None:
+    scene, poses = resting
+    for i in range(len(poses)):
+        hull = shapes.hull(jnp.asarray(scene.shape[i, 0]), jnp.asarray(scene.size[i, 0]))
+        from dipn_jax.geometry import quat_to_matrix
+
+        corners = hull.vertices[hull.alive].reshape(-1, 3) @ quat_to_matrix(poses[i, 0, 3:]).T + poses[i, 0, :3]
+        assert abs(corners[:, 2].min()) < 5e-4
+
+
+def test_a_push_moves_what_it_meets_as_far_as_it_goes(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    rollout = primitives.push(engine, scene, poses, _pushes(5))
+    assert rollout.poses.shape == (5, 12, 2, 7)
+    moved = rollout.poses[:, 10, 0, 0] - poses[:, 0, 0]
+    # the front face travels from -60 to +40 mm; objects are 50 mm wide, from -25 mm: 65 mm, cubes do not roll
+    assert abs(moved[0] - 0.065) < 0.003
+    assert (moved > 0.03).all()
+    travel = rollout.gripper[:, :11, 0] - rollout.gripper[:, :1, 0]
+    np.testing.assert_allclose(travel, np.tile(np.arange(11) * 0.01, (5, 1)), atol=2e-3)
+
+
+def test_push_distance_is_a_value_not_a_program(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    rollout = primitives.push(engine, scene, poses, _pushes(5, distance=0.06))
+    np.testing.assert_allclose(rollout.gripper[:, 10, 0] - rollout.gripper[:, 0, 0], 0.06, atol=2e-3)
+
+
+def test_a_centred_grasp_of_every_class_holds(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    grasps = Grasp(
+        np.zeros((5, 2), np.float32) + poses[:, 0, :2], np.zeros(5, np.float32), np.full(5, 0.02, np.float32)
+    )
+    _, outcome = primitives.grasp(engine, scene, poses, grasps)
+    np.testing.assert_array_equal(outcome.held[:, 0], True)
+    assert not outcome.held[:, 1].any(), "an empty slot is never held"
+
+
+def test_a_grasp_beside_the_object_holds_nothing(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    away = np.tile(np.array([[0.15, 0.0]], np.float32), (5, 1))
+    _, outcome = primitives.grasp(
+        engine, scene, poses, Grasp(away, np.zeros(5, np.float32), np.full(5, 0.02, np.float32))
+    )
+    assert not outcome.success.any()
+
+
+def test_results_do_not_depend_on_threads_or_neighbours(settled: Any) -> None:
+    one, two = native.NativeEngine(threads=1), native.NativeEngine(threads=2)
+    pushes = _pushes(6)
+    a = primitives.push(one, settled.scene, settled.poses, pushes)
+    b = primitives.push(two, settled.scene, settled.poses, pushes)
+    np.testing.assert_array_equal(a.poses, b.poses)
+    alone = primitives.push(
+        one, records.take(settled.scene, slice(2, 3)), settled.poses[2:3], records.take(pushes, slice(2, 3))
+    )
+    np.testing.assert_array_equal(alone.poses[0], a.poses[2])
+
+
+def test_faults_are_data_of_their_own_episode(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    poses = poses.copy()
+    poses[0, 0, 0] = 0.3  # outside
+    poses[1, 0, 2] = 0.4  # still falling
+    poses[2, 0, 2] -= 0.03  # into the table; MuJoCo throws it out again within a few hundredths of a second
+    rollout = primitives.settle(engine, scene, poses, duration=0.01)
+    assert rollout.fault[0] & Fault.OUTSIDE
+    assert rollout.fault[1] & Fault.UNSETTLED
+    assert rollout.fault[2] & Fault.PENETRATION
+    assert rollout.fault[3] == 0 and rollout.fault[4] == 0
+    assert Fault.count(rollout.fault)["outside"] == 1
+
+
+def test_a_gripper_that_is_stopped_says_so(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    heavy = scene.replace(mass=np.full_like(scene.mass, 60.0))
+    rollout = primitives.push(engine, heavy, poses, _pushes(5))
+    trajectory = primitives.push_trajectory(jax.tree.map(jnp.asarray, _pushes(5)))
+    cut = np.array([1.5])  # at the end of travel, before the gripper lifts
+    rollout = engine.simulate(heavy, poses, trajectory, cut)
+    assert (rollout.fault & Fault.SHORT).any()
+
+
+def test_empty_slots_keep_their_pose(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    rollout = primitives.settle(engine, scene, poses, duration=0.1)
+    np.testing.assert_allclose(rollout.poses[:, 0, 1], poses[:, 1], atol=1e-6)
+
+
+def test_unknown_engine_is_refused() -> None:
+    with pytest.raises(UserError, match="engine 'bullet'"):
+        physics.make_engine("bullet")  # type: ignore[arg-type]

@@ -1,0 +1,199 @@
+import functools
+from typing import Any
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+from dipn_jax import geometry, losses, records, render
+from dipn_jax.networks import dipn, grasp
+from dipn_jax.structs import ABSENT, Push
+from dipn_jax.workspace import grasp_angles
+
+SLOTS = 5
+
+
+@pytest.fixture(scope="module")
+def network() -> dipn.DIPN:
+    model = dipn.DIPN(dipn.DipnConfig(), rngs=nnx.Rngs(0))
+    model.eval()
+    return model
+
+
+@pytest.fixture(scope="module")
+def forward(network: dipn.DIPN) -> Any:
+    return nnx.jit(lambda inputs: network(inputs))
+
+
+def _push(x: float = -0.1, y: float = 0.02, angle: float = 0.4, distance: float = 0.05) -> Push:
+    return Push(jnp.array([x, y]), jnp.float32(angle), jnp.float32(distance))
+
+
+@pytest.fixture(scope="module")
+def inputs(settled: Any) -> dipn.PushInput:
+    labels = jax.vmap(render.render_depth)(settled.scene, jnp.asarray(settled.poses))[1]
+    pushes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (6, *leaf.shape)), _push())
+    return dipn.push_inputs(labels, pushes, slots=SLOTS, stride=2)[0]
+
+
+def test_the_push_starts_at_pixel_40_112_and_goes_to_plus_x() -> None:
+    # a mark at the start and one 40 mm ahead along the push
+    push = _push()
+    ahead = push.start + 0.04 * jnp.array([jnp.cos(push.angle), jnp.sin(push.angle)])
+    label = np.full((224, 224), ABSENT)
+    for i, point in enumerate((push.start, ahead)):
+        col, row = np.round(np.asarray(geometry.metres_to_pixels(point))).astype(int)
+        label[row - 1 : row + 2, col - 1 : col + 2] = i
+    made, _ = dipn.push_input(jnp.array(label), push, slots=2, stride=1)
+    rows, cols = np.nonzero(np.asarray(made.scene_map))
+    first = cols < 50
+    np.testing.assert_allclose([cols[first].mean(), rows[first].mean()], dipn.START_PIXEL, atol=0.8)
+    np.testing.assert_allclose([cols[~first].mean(), rows[~first].mean()], [60, 112], atol=0.8)
+    np.testing.assert_allclose(made.centers[1], [0.04, 0.0], atol=2e-3)
+    box = np.asarray(made.push_map)
+    assert box[100:125, 40:66].all() and box.sum() == 25 * 26
+
+
+def test_the_push_frame_is_opencvs_warp(settled: Any) -> None:
+    _, label = render.render_depth(records.take(settled.scene, 0), settled.poses[0])
+    push = _push()
+    made, _ = dipn.push_input(label, push, slots=SLOTS, stride=1)
+    c, s = np.cos(0.4), np.sin(0.4)
+    rotation = np.array([[c, -s], [s, c]])
+    offset = np.asarray(geometry.metres_to_pixels(push.start)) - rotation @ np.array(dipn.START_PIXEL)
+    warp = np.column_stack([rotation, offset])
+    mask = (np.asarray(label) >= 0).astype(np.uint8)
+    want = cv2.warpAffine(mask, warp, (224, 224), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+    assert (np.asarray(made.scene_map) == want).mean() > 0.995
+
+
+def test_crops_are_centred_on_their_own_object(inputs: dipn.PushInput) -> None:
+    own = np.asarray(inputs.crops[..., 0])
+    rows, cols = np.mgrid[:30, :30]
+    for b in range(6):
+        for i in range(SLOTS):
+            if own[b, i].sum() > 50:
+                assert abs((own[b, i] * rows).sum() / own[b, i].sum() - 14.5) < 1.5
+                assert abs((own[b, i] * cols).sum() / own[b, i].sum() - 14.5) < 1.5
+    assert (inputs.crops[..., 0] * inputs.crops[..., 1]).sum() == 0
+
+
+def test_motion_round_trips_between_frames() -> None:
+    motion = jnp.array([[0.01, -0.02, 0.3]])
+    back = dipn.to_workspace(dipn.from_workspace(motion, jnp.float32(0.7)), jnp.float32(0.7))
+    np.testing.assert_allclose(back, motion, atol=1e-6)
+    # along the push is +x of the push frame
+    along = 0.01 * jnp.array([[jnp.cos(0.7), jnp.sin(0.7), 0.0]])
+    np.testing.assert_allclose(dipn.from_workspace(along, jnp.float32(0.7)), [[5.0, 0.0, 0.0]], atol=1e-4)
+
+
+def test_permuting_objects_permutes_the_output(forward: Any, inputs: dipn.PushInput) -> None:
+    order = np.array([3, 1, 4, 0, 2])
+    mixed = inputs.replace(
+        crops=inputs.crops[:, order], centers=inputs.centers[:, order], present=inputs.present[:, order]
+    )
+    np.testing.assert_allclose(forward(mixed), forward(inputs)[:, order], atol=1e-4)
+
+
+def test_objects_out_of_sight_change_nothing(forward: Any, inputs: dipn.PushInput) -> None:
+    hidden = inputs.replace(present=inputs.present.at[:, 3:].set(False))
+    other = hidden.replace(crops=hidden.crops.at[:, 3:].set(1.0), centers=hidden.centers.at[:, 3:].set(0.3))
+    out = forward(hidden)
+    np.testing.assert_array_equal(out, forward(other))
+    np.testing.assert_array_equal(out[:, 3:], 0.0)
+
+
+def test_batch_elements_do_not_interact(forward: Any, inputs: dipn.PushInput) -> None:
+    changed = jax.tree.map(lambda leaf: leaf.at[0].set(jnp.zeros_like(leaf[0])), inputs)
+    np.testing.assert_allclose(forward(changed)[1:], forward(inputs)[1:], atol=1e-5)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_the_mirror_of_an_input_is_the_input_of_the_mirror(stride: int, settled: Any) -> None:
+    # a push along +x through the middle of the map: mirroring the scene is flipping the map's rows
+    _, label = render.render_depth(records.take(settled.scene, 0), settled.poses[0])
+    push = _push(x=-0.143, y=0.0, angle=0.0)
+    make = functools.partial(dipn.push_input, slots=SLOTS, stride=stride)
+    direct = dipn.mirror(jax.tree.map(lambda leaf: leaf[None], make(label, push)[0]))
+    mirrored = jax.tree.map(lambda leaf: leaf[None], make(jnp.flip(label, 0), push)[0])
+    for name in ("scene_map", "crops"):
+        a, b = getattr(direct, name), getattr(mirrored, name)
+        assert np.mean(np.asarray(a) != np.asarray(b)) < 0.02, name
+    np.testing.assert_allclose(direct.centers, mirrored.centers, atol=1e-3)
+
+
+def test_compact_grasp_scores_are_of_the_pixel_they_stand_at() -> None:
+    # the score map of a turned image is the turned score map
+    model = grasp.GraspNet(grasp.GraspConfig(), rngs=nnx.Rngs(0))
+    model.eval()
+    image = jnp.zeros((224, 224, 4)).at[100:130, 60:90, 3].set(0.05)
+    scores = nnx.jit(grasp.score_image)(model, image)
+    assert scores.shape == (16, 224, 224)
+    assert (scores >= 0).all() and (scores <= 1).all()
+    np.testing.assert_array_equal(scores[3], scores[11])
+    quarter = nnx.jit(grasp.score_image)(model, jnp.rot90(image, k=-1, axes=(0, 1)))
+    # rot90 by -1 takes +x (columns) to +y (rows): rotation k becomes k + 4
+    want = jnp.rot90(scores[0], k=-1, axes=(0, 1))
+    assert np.corrcoef(np.ravel(quarter[4]), np.ravel(want))[0, 1] > 0.95
+
+
+def test_geometric_labels_of_a_bar() -> None:
+    # a bar 50 mm wide across the closing direction can be grasped at its middle, not from its end
+    height = jnp.zeros((160, 160)).at[40:120, 68:93].set(0.05)
+    labels = grasp.geometric_labels(height)
+    assert labels[80, 80] == 1
+    assert labels[80, 40] == 0, "no object there"
+    turned = grasp.geometric_labels(height.T)
+    assert turned[80, 80] == 0, "the fingers would land on the bar"
+    crowded = grasp.geometric_labels(height.at[:, 102:112].set(0.05))
+    assert crowded[80, 80] == 0, "a finger would land on the neighbour"
+
+
+def test_best_grasp_is_the_highest() -> None:
+    scores = jnp.zeros((16, 224, 224)).at[5, 17, 200].set(0.9)
+    index, score = grasp.best_grasp(scores)
+    assert index.tolist() == [5, 17, 200] and np.isclose(score, 0.9)
+
+
+def test_the_angles_are_sixteen_even_ones() -> None:
+    np.testing.assert_allclose(np.diff(grasp_angles()), np.pi / 8, atol=1e-6)
+
+
+def _one_step(model: Any, loss: Any) -> tuple[float, float]:
+    """Loss before and after one step of gradient descent."""
+    optimizer = nnx.Optimizer(model, optax.sgd(1e-4), wrt=nnx.Param)
+
+    @nnx.jit
+    def step(m: Any, o: Any) -> jax.Array:
+        value, gradient = nnx.value_and_grad(loss)(m)
+        o.update(m, gradient)
+        return value
+
+    return float(step(model, optimizer)), float(step(model, optimizer))
+
+
+@pytest.mark.slow
+def test_paper_dipn_takes_a_training_step(settled: Any) -> None:
+    model = dipn.DIPN(dipn.DipnConfig(preset="paper"), rngs=nnx.Rngs(0))
+    _, label = render.render_depth(records.take(settled.scene, 0), settled.poses[0])
+    made, _ = dipn.push_input(label, _push(), slots=SLOTS, stride=1)
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
+    target = jnp.ones((2, SLOTS, 3))
+    before, after = _one_step(model, lambda m: losses.motion_loss(m(batch), target, batch.present))
+    assert np.isfinite(before) and after < before
+
+
+@pytest.mark.slow
+def test_paper_grasp_net_takes_a_training_step() -> None:
+    model = grasp.GraspNet(grasp.GraspConfig(preset="paper"), rngs=nnx.Rngs(0))
+    images = jnp.zeros((1, 320, 320, 4)).at[:, 100:150, 100:200, 3].set(0.05)
+    target = jnp.zeros((1, 320, 320)).at[:, 120, 150].set(1.0)
+    model.eval()
+    assert nnx.jit(lambda m, x: m(x))(model, images).shape == (1, 320, 320)
+    model.train()
+    before, after = _one_step(model, lambda m: losses.score_loss(m(images), target, jnp.ones_like(target)))
+    assert np.isfinite(before) and np.isfinite(after)

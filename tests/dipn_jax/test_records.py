@@ -1,0 +1,98 @@
+import json
+import pathlib
+import shutil
+
+import numpy as np
+import pytest
+
+from dipn_jax import records
+from dipn_jax.errors import UserError
+
+
+@pytest.fixture
+def copy(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> pathlib.Path:
+    return pathlib.Path(shutil.copytree(data["push"], tmp_path / "push"))
+
+
+def test_what_is_read_is_what_was_written(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    episodes = records.read_shard(records.shard_path(copy, 0), kind="push")
+    records.write_shard(tmp_path, 3, episodes, kind="push", config={"seed": 0}, faults={})
+    again = records.read_shard(records.shard_path(tmp_path, 3), kind="push")
+    for name in ("poses", "after", "fault"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(episodes, name))
+    np.testing.assert_array_equal(again.scene.size, episodes.scene.size)
+    np.testing.assert_array_equal(again.push.start, episodes.push.start)
+
+
+def test_a_data_set_says_what_made_it(copy: pathlib.Path) -> None:
+    summary = records.summary(copy)
+    assert summary["episodes"] == 24 and summary["shards"] == 2 and summary["kind"] == "push"
+    assert summary["config"]["seed"] == 0 and summary["config"]["engine"] == "native"
+    assert summary["versions"]["mujoco"] != "unknown"
+    assert summary["faults"]["dropped_scenes"] > 0
+
+
+def test_any_tool_opens_a_shard(copy: pathlib.Path) -> None:
+    import pyarrow.parquet
+
+    table = pyarrow.parquet.read_table(records.shard_path(copy, 0))
+    assert "scene.shape" in table.column_names and "push.angle" in table.column_names
+
+
+@pytest.mark.parametrize("damage", ["truncate", "empty", "flip", "delete", "foreign"])
+def test_a_damaged_shard_is_named_and_repaired(copy: pathlib.Path, damage: str) -> None:
+    path = records.shard_path(copy, 1)
+    content = path.read_bytes()
+    if damage == "truncate":
+        path.write_bytes(content[: len(content) // 2])
+    elif damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "flip":
+        path.write_bytes(content[:200] + bytes([content[200] ^ 1]) + content[201:])
+    elif damage == "delete":
+        path.unlink()
+    else:
+        path.write_bytes(b"not a parquet file, but as long" * 100)
+    assert [p.name for p, _ in records.verify(copy)] == [path.name]
+    with pytest.raises(UserError, match=r"shard-00001\.parquet"):
+        records.load(copy, kind="push")
+    records.repair(copy)
+    assert records.verify(copy) == []
+    assert len(records.load(copy, kind="push")[0].fault) == 16
+
+
+def test_the_wrong_kind_a_missing_and_an_old_data_set_are_named(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    with pytest.raises(UserError, match="holds push episodes, want grasp"):
+        records.load(copy, kind="grasp")
+    with pytest.raises(UserError, match="no manifest"):
+        records.load(tmp_path / "nowhere", kind="push")
+    (copy / records.MANIFEST).write_text("{")
+    with pytest.raises(UserError, match="damaged"):
+        records.load(copy, kind="push")
+
+
+def test_another_schema_version_is_named(copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "SCHEMA_VERSION", 99)
+    with pytest.raises(UserError, match="schema version 1, want 99"):
+        records.read_shard(records.shard_path(copy, 0), kind="push")
+
+
+def test_the_fingerprint_follows_the_content(copy: pathlib.Path) -> None:
+    before = records.load(copy, kind="push")[1]
+    assert records.load(copy, kind="push")[1] == before
+    records.shard_path(copy, 1).unlink()
+    records.update_manifest(copy)
+    assert records.load(copy, kind="push")[1] != before
+
+
+def test_a_write_that_dies_leaves_the_old_file(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "manifest.json"
+    records.write_json(path, {"a": 1})
+
+    def die(self: pathlib.Path, target: pathlib.Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pathlib.Path, "rename", die)
+    with pytest.raises(KeyboardInterrupt):
+        records.write_json(path, {"a": 2})
+    assert json.loads(path.read_text()) == {"a": 1}

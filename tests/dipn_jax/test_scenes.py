@@ -1,0 +1,94 @@
+import json
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from dipn_jax import scenes, shapes
+from dipn_jax.errors import UserError
+
+CONFIG = scenes.fixed_count(5)
+
+
+def test_same_key_same_scene_other_key_other_scene() -> None:
+    a, b = (scenes.random_scene(jax.random.key(3), config=CONFIG) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+    c = scenes.random_scene(jax.random.key(4), config=CONFIG)
+    assert not np.array_equal(a[0].size, c[0].size)
+
+
+def test_nothing_overlaps_in_mid_air() -> None:
+    scene, poses = scenes.random_scene(jax.random.key(0), config=CONFIG)
+    radius = np.asarray(shapes.radius(scene.shape, scene.size))
+    gap = np.linalg.norm(np.asarray(poses)[:, None, :3] - np.asarray(poses)[None, :, :3], axis=-1)
+    assert (gap + np.eye(5) > radius[:, None] + radius[None]).all()
+    assert (np.asarray(poses)[:, 2] > radius).all()
+
+
+def test_counts_follow_the_config() -> None:
+    config = scenes.SceneConfig(slots=5, counts=(0.0, 1.0))
+    scene, _ = scenes.random_scene(jax.random.key(0), config=config)
+    assert (np.asarray(scene.shape) >= 0).tolist() == [True, True, False, False, False]
+
+
+def test_hard_cases_load_as_placed() -> None:
+    names, scene, poses = scenes.load_cases(scenes.hard_cases_path())
+    assert len(names) == 10 and scene.shape.shape == (10, 6)
+    raw = json.loads(scenes.hard_cases_path().read_text())["cases"][0]["objects"][0]
+    np.testing.assert_allclose(poses[0, 0, :2], raw["position_m"], atol=1e-6)
+    assert ((scene.shape >= 0).sum(-1) >= 3).all()
+
+
+def test_removed_objects_are_absent_and_parked() -> None:
+    _, scene, poses = scenes.load_cases(scenes.hard_cases_path())
+    gone = np.zeros(6, bool)
+    gone[1] = True
+    after, moved = scenes.remove(jax.tree.map(lambda leaf: leaf[0], scene), poses[0], gone)
+    assert after.shape[1] == -1 and np.abs(moved[1, :2]).max() > 1
+    np.testing.assert_allclose(moved[0], poses[0, 0], atol=1e-7)
+
+
+def _file(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
+    entry = {"shape": "cuboid", "size_mm": [50, 50, 50], "position_m": [0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
+    path = folder / "cases.json"
+    path.write_text(json.dumps({"cases": [{"name": "a", "objects": [entry | changes]}]}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"shape": "sphere"}, "unknown shape 'sphere'"),
+        ({"size_mm": [50, 50]}, "size_mm"),
+        ({"size_mm": [500, 50, 50]}, "diagonal"),
+        ({"position_m": [1, 0]}, "out of range"),
+        ({"quaternion_wxyz": [0, 0, 0, 0]}, "out of range"),
+        ({"position_m": "left"}, "position_m"),
+    ],
+)
+def test_a_wrong_case_file_is_named(tmp_path: pathlib.Path, changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        scenes.load_cases(_file(tmp_path, **changes))
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"cases": []}', '{"cases": [{"name": "x"}]}'])
+def test_a_file_that_is_no_case_file_is_named(tmp_path: pathlib.Path, text: str) -> None:
+    path = tmp_path / "cases.json"
+    path.write_text(text)
+    with pytest.raises(UserError, match="case file"):
+        scenes.load_cases(path)
+
+
+@pytest.mark.parametrize("text", ["0", "31", "7:1", "many", "1:x", "-3"])
+def test_a_wrong_number_of_objects_is_named(text: str) -> None:
+    with pytest.raises(UserError, match="--objects"):
+        scenes.parse_objects(text)
+
+
+def test_a_config_that_contradicts_itself_is_named() -> None:
+    with pytest.raises(UserError, match="counts"):
+        scenes.SceneConfig(slots=2, counts=(0.5, 0.3, 0.2))
+    with pytest.raises(UserError, match="unknown items"):
+        scenes.SceneConfig(items=("banana",))

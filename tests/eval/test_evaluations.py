@@ -1,0 +1,123 @@
+"""Every evaluation on a tiny scale, with networks that have learnt nothing; and the arithmetic of the figures."""
+
+import json
+import pathlib
+from typing import Any
+
+import numpy as np
+import pytest
+from flax import nnx
+
+from dipn_jax import checkpoint, policy, scenes
+from dipn_jax.networks.dipn import DipnConfig
+from dipn_jax.networks.grasp import GraspConfig
+from eval import clearing, grasping, metrics, prediction, report
+
+CONFIG = scenes.fixed_count(3, spread=0.2)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
+    folder = tmp_path_factory.mktemp("runs")
+    for name, config in (("dipn", DipnConfig(width=8)), ("grasp", GraspConfig(width=8))):
+        model = checkpoint.build(name, config)
+        checkpoint.save(folder / name, 1, {"model": nnx.state(model)}, network=name, config=config, extra={})
+        (folder / name / "metrics.jsonl").write_text('{"step": 1, "loss": 1.0}\n{"step": 2, "loss": 0.5}\n')
+    return {name: folder / name for name in ("dipn", "grasp")}
+
+
+def test_interval_holds_the_ratio(rng: np.random.Generator) -> None:
+    trials = rng.integers(1, 10, 200)
+    hits = rng.binomial(trials, 0.7)
+    value, low, high = metrics.ratio_interval(hits, trials)
+    assert value == hits.sum() / trials.sum()
+    assert low < 0.7 < high and high - low < 0.1
+    assert np.isnan(metrics.ratio_interval(np.zeros(3), np.zeros(3))[0])
+
+
+def test_calibration_error_of_known_scores() -> None:
+    assert grasping.calibration_error(np.full(10, 0.95), np.ones(10)) == pytest.approx(0.05)
+    assert grasping.calibration_error(np.full(10, 0.95), np.zeros(10)) == pytest.approx(0.95)
+
+
+def _ended(name: str, steps: list[str], removed: int, objects: int) -> clearing.Instance:
+    instance = clearing.Instance("x", None, np.zeros((1, 7)), objects)  # type: ignore[arg-type]
+    instance.ended, instance.removed = name, removed
+    instance.film = [{"what": step} for step in steps]
+    instance.pushes = steps.count("push")
+    instance.grasps = len(steps) - instance.pushes
+    return instance
+
+
+def test_summary_counts_as_the_paper_does() -> None:
+    rows = [
+        _ended("cleared", ["push", "grasp held", "grasp missed", "grasp held"], 2, 2),
+        _ended("pushed out", ["grasp held", "push"], 1, 3),
+    ]
+    values = clearing.summary(rows)
+    assert values["completion"] == 0.5
+    assert values["grasp_success_all"] == 3 / 4 and values["grasp_success_completed"] == 2 / 3
+    assert values["efficiency_all"] == 3 / 6 and values["efficiency_completed"] == 2 / 4
+    assert values["pushes"] == 2 and values["ended_pushed_out"] == 1
+
+
+def test_prediction_measures_the_baselines_as_they_are(engine: Any, runs: dict[str, pathlib.Path]) -> None:
+    values, films = prediction.evaluate(runs["dipn"], engine, CONFIG, scenes=6, seed=3, physics=True)
+    assert values["pushes"] == 6 and len(films["before"]) > 0
+    # the engine with nominal mass and friction is nearer to the truth than nothing-moves
+    assert values["push_error/physics/10cm/moved"] < values["push_error/static/10cm/moved"]
+    assert values["push_error/static/5cm/all"] < values["push_error/static/10cm/all"]
+    for key, value in values.items():
+        assert np.isfinite(value), key
+
+
+def test_grasp_evaluation_writes_what_it_promises(engine: Any, runs: dict[str, pathlib.Path]) -> None:
+    values = grasping.evaluate(runs["grasp"], engine, CONFIG, scenes=3, seed=3)
+    assert values["attempts"] == 3
+    for name in ("gn", "random_foreground"):
+        assert 0 <= values[f"grasp_success/{name}_low"] <= values[f"grasp_success/{name}"] <= 1
+
+
+@pytest.fixture(scope="module")
+def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Two hard cases acted on by networks that know nothing, so that every kind of step occurs."""
+    out = tmp_path_factory.mktemp("clear")
+    tables = clearing.hard_instances(engine, scenes.hard_cases_path(), ["06", "10"], slots=6, repeats=1, seed=0)
+    config = clearing.ClearConfig(candidates=4, threshold=2.0, gamma=1.05)
+    predictor, scorer = policy.load_predictor(runs["dipn"], 6), policy.load_scorer(runs["grasp"])
+    clearing.clear(tables, engine, predictor, scorer, config, seed=0)
+    clearing.save(tables, out)
+    metrics.write(out, clearing.summary(tables), settings={})
+    return tables, out
+
+
+def test_every_table_ends_by_the_rules(cleared: Any) -> None:
+    tables, out = cleared
+    for table in tables:
+        assert table.ended in ("cleared", "pushed out", "out of actions")
+        assert table.actions <= 3 * table.objects and table.actions == len(table.film)
+        assert table.removed == table.objects - (table.scene.shape >= 0).sum()
+    listed = json.loads((out / "episodes.json").read_text())
+    assert [entry["name"] for entry in listed] == ["06", "10"]
+    film = np.load(out / listed[0]["file"])
+    assert film["before"].shape[1:] == (224, 224, 3) and len(film["what"]) == len(tables[0].film)
+
+
+def test_the_report_is_one_file_with_its_pictures(
+    cleared: Any, engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
+) -> None:
+    values, films = prediction.evaluate(runs["dipn"], engine, CONFIG, scenes=2, seed=3, physics=False)
+    (tmp_path / "p").mkdir()
+    np.savez_compressed(tmp_path / "p" / "films.npz", **films)  # type: ignore[arg-type]
+    metrics.write(tmp_path / "p", values, settings={})
+    merged = report.write(
+        tmp_path, prediction=tmp_path / "p", grasp=None, hard=cleared[1], random=None, runs=list(runs.values())
+    )
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert 'src="http' not in page and "href=" not in page
+    assert merged["clear/hard/completion"] == metrics.read(cleared[1])["completion"]
+    assert (
+        json.loads((tmp_path / "metrics.json").read_text())["push_error/dipn/5cm/all"]
+        == values["push_error/dipn/5cm/all"]
+    )

@@ -1,0 +1,96 @@
+"""Bad input at the command line: one line on standard error, exit code 2, nothing half-written."""
+
+import pathlib
+import shutil
+
+import pytest
+
+from datagen import cli as datagen_cli
+from dipn_jax import console, records
+from eval import cli as eval_cli
+from train import cli as train_cli
+
+COMMANDS = {
+    "datagen": {
+        "push": datagen_cli.push,
+        "grasp": datagen_cli.grasp,
+        "images": datagen_cli.images,
+        "verify": datagen_cli.verify,
+        "repair": datagen_cli.repair,
+        "info": datagen_cli.info,
+    },
+    "train": {"push": train_cli.push, "grasp-pretrain": train_cli.grasp_pretrain, "grasp": train_cli.grasp},
+    "eval": {
+        "prediction": eval_cli.predict,
+        "grasp": eval_cli.grasp,
+        "clear": eval_cli.clear,
+        "report": eval_cli.report,
+    },
+}
+
+
+@pytest.fixture
+def call(capfd: pytest.CaptureFixture[str]):
+    def run(stage: str, *arguments: object) -> tuple[int, str]:
+        code = console.run("test", COMMANDS[stage], [str(a) for a in arguments])
+        return code, capfd.readouterr().err
+
+    return run
+
+
+def _one_line(result: tuple[int, str], says: str) -> None:
+    code, error = result
+    assert code == 2
+    assert error.startswith("error: ") and error.count("\n") == 1, error
+    assert says in error
+    assert "Traceback" not in error
+
+
+def test_a_negative_count(call, tmp_path: pathlib.Path) -> None:
+    _one_line(call("datagen", "push", "--out", tmp_path / "d", "--episodes", "-5"), "--episodes -5")
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_missing_folder(call, tmp_path: pathlib.Path) -> None:
+    nowhere = tmp_path / "nowhere"
+    _one_line(call("datagen", "info", nowhere), "no manifest.json")
+    _one_line(call("datagen", "repair", nowhere), "no such folder")
+    _one_line(call("train", "push", "--data", nowhere, "--out", tmp_path / "r"), "no manifest.json")
+    _one_line(call("eval", "prediction", "--push-net", nowhere, "--out", tmp_path / "e"), "no such folder")
+    _one_line(call("eval", "clear", "--grasp-net", nowhere, "--out", tmp_path / "e"), "--push-net")
+    _one_line(call("eval", "report", "--out", tmp_path / "e", "--hard", nowhere), "metrics.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_truncated_shard(call, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    copy = pathlib.Path(shutil.copytree(data["push"], tmp_path / "push"))
+    path = records.shard_path(copy, 0)
+    path.write_bytes(path.read_bytes()[:1000])
+    _one_line(call("datagen", "verify", copy), "shard-00000.parquet")
+    _one_line(call("train", "push", "--data", copy, "--out", tmp_path / "r"), "repair")
+    assert not (tmp_path / "r").exists()
+
+
+def test_an_unknown_shape_in_a_case_file(call, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "cases.json"
+    path.write_text('{"cases": [{"name": "a", "objects": [{"shape": "sphere"}]}]}')
+    _one_line(
+        call("eval", "clear", "--grasp-net", tmp_path, "--method", "gn", "--cases", path, "--out", tmp_path / "e"),
+        "sphere",
+    )
+
+
+def test_an_option_that_does_not_exist_exits_with_2(call) -> None:
+    with pytest.raises(SystemExit) as stop:
+        call("datagen", "push", "--bananas", "3")
+    assert stop.value.code == 2
+
+
+@pytest.mark.parametrize("stage", COMMANDS)
+def test_help_teaches(stage: str, capfd: pytest.CaptureFixture[str]) -> None:
+    for name in COMMANDS[stage]:
+        with pytest.raises(SystemExit) as stop:
+            console.run("test", COMMANDS[stage], [name, "--help"])
+        assert stop.value.code == 0
+        text = capfd.readouterr().out
+        assert len(text) > 300 or name in ("verify", "repair", "info")

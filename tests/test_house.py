@@ -1,0 +1,128 @@
+"""The house itself: layers, conventions, packaging."""
+
+import ast
+import importlib
+import inspect
+import pathlib
+import pkgutil
+import subprocess
+import sys
+import zipfile
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parent.parent
+STAGES = ("datagen", "train", "eval")
+# library modules in the order of the arrows: each may import only what stands before it
+ORDER = [
+    "errors", "structs", "workspace", "geometry", "shapes", "scenes", "model", "physics", "primitives", "render",
+    "candidates", "imagine", "losses", "networks", "planner", "records", "checkpoint", "clutter", "policy", "console",
+]  # fmt: skip
+
+
+def _imports(path: pathlib.Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def _tops(path: pathlib.Path) -> set[str]:
+    return {name.split(".")[0] for name in _imports(path)}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_stages_import_the_library_and_never_one_another(stage: str) -> None:
+    for path in (ROOT / stage).rglob("*.py"):
+        assert not _tops(path) & (set(STAGES) - {stage}), path
+
+
+def test_the_library_imports_no_stage() -> None:
+    for path in (ROOT / "dipn_jax").rglob("*.py"):
+        assert not _tops(path) & set(STAGES), path
+
+
+def test_inside_the_library_the_arrows_point_one_way() -> None:
+    for path in (ROOT / "dipn_jax").rglob("*.py"):
+        room = path.relative_to(ROOT / "dipn_jax").parts[0].removesuffix(".py")
+        if room in ("__init__", "data"):
+            continue
+        assert room in ORDER, f"{room}: give it a place in ORDER"
+        for name in _imports(path):
+            parts = name.split(".")
+            if parts[0] == "dipn_jax" and len(parts) > 1 and parts[1] in ORDER and parts[1] != room:
+                assert ORDER.index(parts[1]) < ORDER.index(room), f"{room} imports {parts[1]}"
+
+
+def test_planner_knows_no_physics_and_networks_no_simulation() -> None:
+    for room, forbidden in (("planner.py", "physics"), ("networks", "physics"), ("networks", "scenes")):
+        place = ROOT / "dipn_jax" / room
+        for path in [place] if place.is_file() else place.glob("*.py"):
+            assert not any(name.startswith(f"dipn_jax.{forbidden}") for name in _imports(path)), path
+
+
+def _public_functions() -> list[tuple[str, object]]:
+    found = []
+    for package in ("dipn_jax", *STAGES):
+        for info in pkgutil.walk_packages([str(ROOT / package)], f"{package}."):
+            module = importlib.import_module(info.name)
+            for name, item in vars(module).items():
+                item = inspect.unwrap(item) if callable(item) else item
+                own = getattr(item, "__module__", None) == info.name
+                if inspect.isfunction(item) and own and not name.startswith("_"):
+                    found.append((f"{info.name}.{name}", item))
+    return found
+
+
+def test_conventions() -> None:
+    functions = _public_functions()
+    assert len(functions) > 80
+    for name, function in functions:
+        parameters = list(inspect.signature(function).parameters.values())
+        assert function.__doc__, f"{name}: no docstring"
+        assert all(p.annotation is not p.empty for p in parameters), f"{name}: untyped argument"
+        keys = [i for i, p in enumerate(parameters) if p.name == "key"]
+        assert keys in ([], [0]), f"{name}: the key comes first"
+        for p in parameters:
+            if p.default is not p.empty and name.split(".")[1] != "cli" and name.startswith("dipn_jax"):
+                positional = p.kind is p.POSITIONAL_OR_KEYWORD
+                allowed = {"fill", "config", "arguments", "note", "threads"}
+                assert not positional or p.name in allowed, f"{name}: option {p.name} is keyword-only"
+
+
+def test_every_module_has_a_docstring_and_is_of_readable_size() -> None:
+    for package in ("dipn_jax", *STAGES):
+        for path in (ROOT / package).rglob("*.py"):
+            text = path.read_text()
+            if text.strip():
+                assert ast.get_docstring(ast.parse(text)), path
+            assert text.count("\n") <= 320, path
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_all_four_packages_and_the_data(tmp_path: pathlib.Path) -> None:
+    """Built, installed without its dependencies beside this environment's, imported from another folder."""
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)],
+        check=True,
+        capture_output=True,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "dipn_jax/data/hard_cases.json" in names and "dipn_jax/py.typed" in names
+    assert not any(name.startswith(("tests", "benchmarks")) for name in names)
+    site = tmp_path / "site"
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(site), str(wheel)], check=True
+    )
+    script = (
+        "import dipn_jax.scenes, datagen.cli, train.cli, eval.cli, pathlib; "
+        "assert len(dipn_jax.scenes.load_cases(dipn_jax.scenes.hard_cases_path())[0]) == 10; "
+        "assert pathlib.Path(dipn_jax.__file__).is_relative_to(pathlib.Path.cwd() / 'site'), dipn_jax.__file__"
+    )
+    environment = {"PYTHONPATH": str(site), "PATH": "", "HOME": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path, env=environment)
