@@ -131,9 +131,9 @@ def parked(n: int) -> jax.Array:
 
 
 def remove(scene: Scene, poses: Array, gone: Array) -> tuple[Scene, jax.Array]:
-    """The scene without the objects `gone [N]`."""
+    """Scenes `[..., N]` and poses `[..., N, 7]` without the objects `gone [..., N]`, which are parked."""
     shape = jnp.where(gone, ABSENT, scene.shape)
-    return scene.replace(shape=shape), jnp.where(gone[:, None], parked(len(gone)), poses)
+    return scene.replace(shape=shape), jnp.where(gone[..., None], parked(gone.shape[-1]), poses)
 
 
 def hard_cases_path() -> pathlib.Path:

@@ -28,18 +28,18 @@ class Bottleneck(nnx.Module):
         self.spatial = conv(width, width, 3, rngs, stride=stride, bias=False)
         self.expand = conv(width, out, 1, rngs, bias=False)
         self.norms = nnx.List([nnx.BatchNorm(f, rngs=rngs) for f in (width, width, out)])
-        self.project: nnx.Conv | None = None
-        self.project_norm: nnx.BatchNorm | None = None
+        self.project: nnx.List = nnx.List([])  # empty where the input can be added as it is
         if stride != 1 or features_in != out:
-            self.project = conv(features_in, out, 1, rngs, stride=stride, bias=False)
-            self.project_norm = nnx.BatchNorm(out, rngs=rngs)
+            self.project = nnx.List(
+                [conv(features_in, out, 1, rngs, stride=stride, bias=False), nnx.BatchNorm(out, rngs=rngs)]
+            )
 
     def __call__(self, x: jax.Array) -> jax.Array:
         y = nnx.relu(self.norms[0](self.reduce(x)))
         y = nnx.relu(self.norms[1](self.spatial(y)))
         y = self.norms[2](self.expand(y))
-        if self.project is not None and self.project_norm is not None:
-            x = self.project_norm(self.project(x))
+        for layer in self.project:
+            x = layer(x)
         return nnx.relu(x + y)
 
 

@@ -28,6 +28,18 @@ MAX_SHORT = 0.01
 """Metres by which a gripper may miss its last set point."""
 
 
+def substeps(config: PhysicsConfig) -> int:
+    """Time steps in a control period.
+
+    Raises:
+      UserError: that is not a whole number.
+    """
+    count = round(CONTROL_PERIOD / config.timestep) if config.timestep > 0 else 0
+    if count < 1 or abs(count * config.timestep - CONTROL_PERIOD) > 1e-9:
+        raise UserError(f"physics timestep {config.timestep}: want {CONTROL_PERIOD} over a whole number")
+    return count
+
+
 class Engine(Protocol):
     """Simulates a batch of independent scenes."""
 

@@ -24,7 +24,7 @@ class NativeEngine:
     name = "native"
 
     def __init__(self, config: PhysicsConfig = DEFAULTS, *, threads: int | None = None) -> None:
-        self.config = config
+        self.config, self.substeps = config, physics.substeps(config)
         self.threads = threads or os.cpu_count() or 1
 
     def simulate(
@@ -41,16 +41,15 @@ class NativeEngine:
         sims.qpos[:, GRIPPER_DOF:] = np.take_along_axis(poses, slots[..., None], 1).reshape(len(models), -1)
         sims.qpos[:, :GRIPPER_DOF] = _controls(trajectories, 0.0)
         ticks = np.round(instants / physics.CONTROL_PERIOD).astype(int)
-        substeps = round(physics.CONTROL_PERIOD / self.config.timestep)
         stored_poses, stored_gripper = [], []
         for tick in range(int(ticks[-1]) + 1):
             for _ in range(int((ticks == tick).sum())):
-                stored_poses.append(_unpack(sims.qpos[:, GRIPPER_DOF:], poses, slots))
+                stored_poses.append(_unpack(sims.qpos[:, GRIPPER_DOF:], poses, slots, packed.shape >= 0))
                 stored_gripper.append(_gripper(sims.qpos))
             if tick < ticks[-1]:
                 sims.ctrl[:] = _controls(trajectories, tick * physics.CONTROL_PERIOD + GRIPPER.lag)
                 try:
-                    sims.step(nstep=substeps)
+                    sims.step(nstep=self.substeps)
                 except mujoco_batch.SimulationError as error:
                     watch.raised(error.ids)
                 watch.tick()
@@ -130,10 +129,12 @@ def _pack(scenes: Scene, poses: np.ndarray) -> tuple[Scene, np.ndarray]:
     return jax.tree.map(take, scenes), slots
 
 
-def _unpack(qpos: np.ndarray, poses: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    """Object poses `[B, N, 7]` in the caller's slots; slots that were not simulated keep their pose."""
+def _unpack(qpos: np.ndarray, poses: np.ndarray, slots: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Object poses `[B, N, 7]` in the caller's slots; empty slots keep their pose (as bodies they just fall)."""
     out = np.array(poses)
-    np.put_along_axis(out, slots[..., None], np.array(qpos).reshape(*slots.shape, 7).astype(out.dtype), 1)
+    fresh = np.array(qpos).reshape(*slots.shape, 7).astype(out.dtype)
+    old = np.take_along_axis(out, slots[..., None], 1)
+    np.put_along_axis(out, slots[..., None], np.where(present[..., None], fresh, old), 1)
     return out
 
 

@@ -1,5 +1,6 @@
 import json
 import pathlib
+from typing import Any
 
 import jax
 import numpy as np
@@ -61,19 +62,20 @@ def test_a_folder_belongs_to_one_run(task: PushTask, tmp_path: pathlib.Path) -> 
         fit(task, TrainConfig(steps=6, batch=2), tmp_path)
 
 
+def _loss(task: Any, model: nnx.Module, count: int) -> float:
+    """Loss on the first `count` training examples."""
+    graph, state = nnx.split(model)
+    batch = task.fetch(np.arange(count))
+    return float(jax.jit(lambda s: task.loss(nnx.merge(graph, s), batch, jax.random.key(5)))(state))
+
+
 @pytest.mark.slow
 def test_dipn_learns_what_it_is_shown(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
-    """Ninety steps on 21 pushes: the loss on them falls to a third, for real."""
+    """A hundred and twenty steps on 22 pushes: the loss on them halves, for real."""
     task = PushTask(data["push"], SMALL, limit=None, centimetres=(10,))
-    fit(task, TrainConfig(steps=91, batch=8, learning_rate=3e-3, eval_every=1000, save_every=1000), tmp_path)
+    fit(task, TrainConfig(steps=120, batch=8, learning_rate=3e-3, eval_every=1000, save_every=1000), tmp_path)
     trained = checkpoint.load_network(tmp_path, network="dipn")
-    fresh = checkpoint.build("dipn", SMALL)
-    batch = task.fetch(np.arange(16))
-    loss = jax.jit(
-        lambda model_state, graph: task.loss(nnx.merge(graph, model_state), batch, jax.random.key(5)), static_argnums=1
-    )
-    before, after = (float(loss(*reversed(nnx.split(model)))) for model in (fresh, trained))
-    assert after < before / 3
+    assert _loss(task, trained, 16) < _loss(task, checkpoint.build("dipn", SMALL), 16) / 2
 
 
 @pytest.mark.slow
@@ -82,20 +84,16 @@ def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tm
     config = GraspConfig(width=8)
     pretrain = PretrainTask(data["images"], config)
     first = fit(
-        pretrain, TrainConfig(steps=40, batch=3, learning_rate=5e-3, eval_every=40, save_every=40), tmp_path / "a"
+        pretrain, TrainConfig(steps=100, batch=3, learning_rate=5e-3, eval_every=100, save_every=100), tmp_path / "a"
     )
     assert first["held_out_loss"] < 0.5
     initial = checkpoint.load_network(tmp_path / "a", network="grasp")
     task = GraspTask(data["grasp"], config)
-    result = fit(
-        task,
-        TrainConfig(steps=60, batch=16, learning_rate=3e-3, eval_every=60, save_every=60),
-        tmp_path / "b",
-        initial=initial,
-    )
+    plan = TrainConfig(steps=100, batch=16, learning_rate=3e-3, eval_every=100, save_every=100)
+    fit(task, plan, tmp_path / "b", initial=initial)
     rate = task.train_set.success.mean()
     entropy = -(rate * np.log(rate) + (1 - rate) * np.log(1 - rate))
-    assert result["loss"] < 0.8 * entropy
+    assert _loss(task, checkpoint.load_network(tmp_path / "b", network="grasp"), 20) < 0.7 * entropy
 
 
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
