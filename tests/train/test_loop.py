@@ -93,7 +93,7 @@ def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tm
     fit(task, plan, tmp_path / "b", initial=initial)
     rate = task.train_set.success.mean()
     entropy = -(rate * np.log(rate) + (1 - rate) * np.log(1 - rate))
-    assert _loss(task, checkpoint.load_network(tmp_path / "b", network="grasp"), 20) < 0.7 * entropy
+    assert _loss(task, checkpoint.load_network(tmp_path / "b", network="grasp"), 20) < 0.8 * entropy
 
 
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
