@@ -25,7 +25,7 @@ def push(
     actions: int = 3,
     shard_size: int = 500,
     engine: EngineName = "native",
-    timestep: float = 0.002,
+    timestep: float | None = None,
     shard: int = 0,
     of: int = 1,
 ) -> None:
@@ -42,7 +42,7 @@ def push(
       actions: different pushes tried on each settled scene.
       shard_size: episodes in a file; files are the unit of resuming and of sharing work.
       engine: native (CPU), mjx (XLA), or auto.
-      timestep: seconds of a physics step (native).
+      timestep: seconds of a physics step; the engine's own if not given.
       shard: this worker's number.
       of: number of workers; each makes every of-th shard of the same data set.
     """
@@ -58,7 +58,7 @@ def grasp(
     actions: int = 6,
     shard_size: int = 600,
     engine: EngineName = "native",
-    timestep: float = 0.002,
+    timestep: float | None = None,
     shard: int = 0,
     of: int = 1,
 ) -> None:
@@ -75,7 +75,7 @@ def grasp(
       actions: different grasps tried on each settled scene.
       shard_size: episodes in a file.
       engine: native (CPU), mjx (XLA), or auto.
-      timestep: seconds of a physics step (native).
+      timestep: seconds of a physics step; the engine's own if not given.
       shard: this worker's number.
       of: number of workers; each makes every of-th shard of the same data set.
     """
@@ -90,7 +90,7 @@ def images(
     seed: int = 0,
     shard_size: int = 100,
     engine: EngineName = "native",
-    timestep: float = 0.002,
+    timestep: float | None = None,
     shard: int = 0,
     of: int = 1,
 ) -> None:
@@ -105,7 +105,7 @@ def images(
       seed: seed of everything random.
       shard_size: scenes in a file.
       engine: native (CPU), mjx (XLA), or auto.
-      timestep: seconds of a physics step (native).
+      timestep: seconds of a physics step; the engine's own if not given.
       shard: this worker's number.
       of: number of workers; each makes every of-th shard of the same data set.
     """

@@ -11,9 +11,9 @@ from typing import Any
 import jax
 
 from datagen import episodes
-from dipn_jax import clutter, console, model, records
+from dipn_jax import clutter, console, records
 from dipn_jax.errors import UserError
-from dipn_jax.physics import Engine, EngineName, make_engine
+from dipn_jax.physics import Engine, EngineName, make_engine, resolve
 from dipn_jax.scenes import SceneConfig
 
 MAX_ATTEMPTS = 100
@@ -31,7 +31,7 @@ class Job:
     shard_size: int
     actions: int
     engine: EngineName
-    timestep: float
+    timestep: float | None  # seconds; the engine's own if None
 
     def shards(self) -> int:
         """How many shards the data set has."""
@@ -72,13 +72,12 @@ def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1) -> None
     Raises:
       UserError: the folder holds a data set of another config.
     """
-    console.require_positive(
-        episodes=job.episodes, shard_size=job.shard_size, actions=job.actions, of=of, timestep=job.timestep
-    )
+    console.require_positive(episodes=job.episodes, shard_size=job.shard_size, actions=job.actions, of=of)
     if not 0 <= part < of:
         raise UserError(f"--shard {part} --of {of}: want 0 <= shard < of")
+    job = dataclasses.replace(job, engine=resolve(job.engine))
+    engine = make_engine(job.engine, timestep=job.timestep)
     _check_same(job, out)
-    engine = make_engine(job.engine, _physics(job))
     todo = [i for i in range(part, job.shards(), of) if not _written(out, i, job)]
     mine = range(part, job.shards(), of)
     size = lambda i: min(job.shard_size, job.episodes - i * job.shard_size)  # noqa: E731
@@ -86,16 +85,10 @@ def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1) -> None
     with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(size, todo))) as progress:
         for index in todo:
             made, counts = shard(job, index, engine, progress)
-            records.write_shard(
-                out, index, made, kind=job.kind, config=job.describe() | {"engine": engine.name}, faults=counts
-            )
+            records.write_shard(out, index, made, kind=job.kind, config=job.describe(), faults=counts)
             records.update_manifest(out)
     manifest = records.update_manifest(out)
     console.say(f"{out}: {manifest['episodes']} {job.kind} episodes in {len(manifest['shards'])} shards")
-
-
-def _physics(job: Job) -> model.PhysicsConfig | None:
-    return dataclasses.replace(model.PhysicsConfig(), timestep=job.timestep) if job.engine == "native" else None
 
 
 def _written(out: pathlib.Path, index: int, job: Job) -> bool:

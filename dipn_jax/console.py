@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import os
 import pathlib
+import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from types import TracebackType
@@ -25,6 +27,7 @@ LOG_PERIOD = 10.0
 
 def enable_compilation_cache() -> None:
     """Keep compiled programs in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`)."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # XLA remarks on every program it finds in the cache
     home = os.environ.get("XDG_CACHE_HOME") or str(pathlib.Path.home() / ".cache")
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(pathlib.Path(home) / "dipn-jax" / "xla")
     jax.config.update("jax_compilation_cache_dir", folder)
@@ -107,6 +110,8 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
       (what was written before stays valid, and the same command goes on from there).
     """
     enable_compilation_cache()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job manager's stop is an interruption
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,)

@@ -35,7 +35,7 @@ def write(
     random: pathlib.Path | None,
     runs: list[pathlib.Path],
 ) -> dict[str, Any]:
-    """Write `report.html` and `metrics.json` to `out` and return the merged metrics.
+    """Write `report.html`, its pictures and `metrics.json` to `out` and return the merged metrics.
 
     Args:
       out: folder.
@@ -50,19 +50,20 @@ def write(
     """
     values: dict[str, Any] = {}
     parts: list[str] = []
+    pictures = out / "pictures"
     if hard or random:
         clears = {name: folder for name, folder in (("hard", hard), ("random", random)) if folder}
         for name, folder in clears.items():
             values |= {f"clear/{name}/{key}": value for key, value in metrics.read(folder).items()}
-        parts.append(_clear_section(clears, values))
+        parts.append(_clear_section(clears, values, pictures))
     if prediction:
         values |= metrics.read(prediction)
-        parts.append(_prediction_section(prediction, values))
+        parts.append(_prediction_section(prediction, values, pictures))
     if grasp:
         values |= metrics.read(grasp)
         parts.append(_grasp_section(values))
     if runs:
-        parts.append(f"<h2>Learning curves</h2>{_image(_curves(runs))}")
+        parts.append(f"<h2>Learning curves</h2>{_image(_curves(runs), pictures / 'curves.png')}")
     if not parts:
         raise UserError("report: nothing to report; give --prediction, --grasp, --hard, --random or --runs")
     versions = ", ".join(f"{k} {v}" for k, v in records.package_versions().items())
@@ -91,7 +92,7 @@ def _percent(values: dict[str, Any], key: str) -> str:
     return f"{100 * value:.1f}{interval}"
 
 
-def _clear_section(clears: dict[str, pathlib.Path], values: dict[str, Any]) -> str:
+def _clear_section(clears: dict[str, pathlib.Path], values: dict[str, Any], pictures: pathlib.Path) -> str:
     columns = ["completion", "grasp_success_completed", "grasp_success_all", "efficiency_completed", "efficiency_all"]
     rows = []
     for name in clears:
@@ -99,7 +100,10 @@ def _clear_section(clears: dict[str, pathlib.Path], values: dict[str, Any]) -> s
         counts = [str(values[f"{at}/{key}"]) for key in ("instances", "grasps", "pushes")]
         rows.append([name, *counts, *[_percent(values, f"{at}/{key}") for key in columns]])
     head = ["", "tables", "grasps", "pushes", *[f"{c.replace('_', ' ')} %" for c in columns]]
-    films = "".join(f"<h3>{html.escape(name)}</h3>{_image(_filmstrip(folder))}" for name, folder in clears.items())
+    films = "".join(
+        f"<h3>{html.escape(name)}</h3>{_image(_filmstrip(folder), pictures / f'clear-{name}.png')}"
+        for name, folder in clears.items()
+    )
     return (
         f"<h2>Clearing tables</h2>{_table(head, rows)}<p>With bootstrap 95 % intervals over tables.</p>"
         "<h2>What was seen, chosen, imagined, and what happened</h2>"
@@ -108,7 +112,7 @@ def _clear_section(clears: dict[str, pathlib.Path], values: dict[str, Any]) -> s
     )
 
 
-def _prediction_section(folder: pathlib.Path, values: dict[str, Any]) -> str:
+def _prediction_section(folder: pathlib.Path, values: dict[str, Any], pictures: pathlib.Path) -> str:
     rows = []
     for name in ("dipn", "static", "trans", "physics"):
         if f"push_error/{name}/5cm/all" not in values:
@@ -123,7 +127,7 @@ def _prediction_section(folder: pathlib.Path, values: dict[str, Any]) -> str:
     head = ["", *[f"{m} {d} {w}" for m in ("1-IoU", "XOR/2") for d in ("5 cm", "10 cm") for w in ("all", "moved")]]
     try:
         films = np.load(folder / "films.npz")
-        picture = _image(_prediction_film(films))
+        picture = _image(_prediction_film(films), pictures / "prediction.png")
     except (OSError, ValueError):
         raise UserError(f"{folder}: no readable films.npz; run dipn-eval prediction again") from None
     return (
@@ -140,11 +144,13 @@ def _grasp_section(values: dict[str, Any]) -> str:
     )
 
 
-def _image(figure: Any) -> str:
+def _image(figure: Any, path: pathlib.Path) -> str:
+    """The figure as an HTML image with its content inside; also kept at `path`."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}">'
+    records.write_atomically(path, stream.getvalue())
+    return f'<img alt="{path.stem}" src="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}">'
 
 
 def _show(axis: Any, picture: np.ndarray, title: str = "") -> None:

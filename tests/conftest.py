@@ -31,7 +31,7 @@ def settled(engine: Any) -> Any:
 
 
 def _job(kind: str, episodes: int, actions: int) -> Job:
-    return Job(kind, scenes.fixed_count(3, spread=0.2), episodes, 0, 16, actions, "native", 0.002)
+    return Job(kind, scenes.fixed_count(3, spread=0.2), episodes, 0, 16, actions, "native", None)
 
 
 @pytest.fixture(scope="session")

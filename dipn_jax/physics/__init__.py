@@ -6,6 +6,7 @@ one runs is a configuration value.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal, Protocol
 
 import jax
@@ -64,24 +65,34 @@ class Engine(Protocol):
         ...
 
 
-def make_engine(name: EngineName, config: PhysicsConfig | None = None) -> Engine:
-    """The engine called `name`; `auto` is `native` on a CPU and `mjx` on an accelerator.
+def resolve(name: EngineName) -> EngineName:
+    """`auto` is `native` on a CPU and `mjx` on an accelerator."""
+    if name == "auto":
+        return "native" if jax.default_backend() == "cpu" else "mjx"
+    return name
+
+
+def make_engine(name: EngineName, *, timestep: float | None = None) -> Engine:
+    """The engine called `name`, with its own solver settings.
 
     Args:
-      name: engine.
-      config: solver settings; each engine's own defaults if not given.
+      name: engine, or `auto`.
+      timestep: seconds of a physics step, instead of the engine's own.
 
     Raises:
-      UserError: no such engine.
+      UserError: no such engine, or a time step that does not divide the control period.
     """
-    if name == "auto":
-        name = "native" if jax.default_backend() == "cpu" else "mjx"
+    name = resolve(name)
     if name == "native":
         from dipn_jax.physics import native
 
-        return native.NativeEngine(config or native.DEFAULTS)
+        return native.NativeEngine(_with_timestep(native.DEFAULTS, timestep))
     if name == "mjx":
         from dipn_jax.physics import mjx
 
-        return mjx.MjxEngine(config or mjx.DEFAULTS)
+        return mjx.MjxEngine(_with_timestep(mjx.DEFAULTS, timestep))
     raise UserError(f"engine {name!r}: want auto, native or mjx")
+
+
+def _with_timestep(config: PhysicsConfig, timestep: float | None) -> PhysicsConfig:
+    return config if timestep is None else dataclasses.replace(config, timestep=timestep)

@@ -93,7 +93,8 @@ class MjxEngine:
         if slots not in self.programs:
             with jax.numpy_rank_promotion("allow"):
                 self.programs[slots] = jax.jit(_Program(self.config, slots, self.substeps).run)
-        size = min(batch, self.chunk)
+        # powers of two, so that batches of many sizes share few programs
+        size = min(1 << (batch - 1).bit_length(), self.chunk)
         done = []
         for start in range(0, batch, size):
             rows = np.minimum(np.arange(start, start + size), batch - 1)

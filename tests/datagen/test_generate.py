@@ -10,7 +10,7 @@ from datagen.generate import Job, generate
 from dipn_jax import records, scenes
 from dipn_jax.errors import UserError
 
-JOB = Job("push", scenes.fixed_count(3, spread=0.2), 24, 0, 16, 4, "native", 0.002)
+JOB = Job("push", scenes.fixed_count(3, spread=0.2), 24, 0, 16, 4, "native", None)
 
 
 @pytest.fixture
@@ -87,9 +87,12 @@ def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
 
 
 def test_nonsense_is_refused(tmp_path: pathlib.Path) -> None:
-    for change in ({"episodes": -1}, {"shard_size": 0}, {"actions": 0}, {"timestep": -0.1}):
+    for change in ({"episodes": -1}, {"shard_size": 0}, {"actions": 0}):
         with pytest.raises(UserError, match="want a number above 0"):
             generate(dataclasses.replace(JOB, **change), tmp_path / "x")
+    for timestep in (-0.002, 0.004, 0.0):
+        with pytest.raises(UserError, match="timestep"):
+            generate(dataclasses.replace(JOB, timestep=timestep), tmp_path / "x")
     with pytest.raises(UserError, match="--shard 2 --of 2"):
         generate(JOB, tmp_path / "x", part=2, of=2)
     assert not (tmp_path / "x").exists()
