@@ -27,7 +27,6 @@ LOG_PERIOD = 10.0
 
 def enable_compilation_cache() -> None:
     """Keep compiled programs in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`)."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # XLA remarks on every program it finds in the cache
     home = os.environ.get("XDG_CACHE_HOME") or str(pathlib.Path.home() / ".cache")
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(pathlib.Path(home) / "dipn-jax" / "xla")
     jax.config.update("jax_compilation_cache_dir", folder)

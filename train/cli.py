@@ -100,7 +100,7 @@ def grasp(
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
     steps: int = 800,
-    batch: int = 64,
+    batch: int = 32,
     learning_rate: float = 1e-3,
     weight_decay: float = 1e-4,
     seed: int = 0,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import logging
 import pathlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import grain
 import jax
 import numpy as np
 import optax
@@ -18,6 +18,9 @@ from flax import nnx
 
 from dipn_jax import checkpoint, console, records
 from dipn_jax.errors import UserError
+
+logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
+import grain  # noqa: E402
 
 
 @dataclasses.dataclass(frozen=True)
