@@ -14,7 +14,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Decision, Observation, Push, Scene
 from dipn_jax.workspace import WORKSPACE
-from eval import metrics
+from eval import metrics, resume
 
 ACTIONS_PER_OBJECT = 3
 """Source: the paper; more actions than that is a failure."""
@@ -96,27 +96,32 @@ def clear(
     predictor: planner.Predictor,
     scorer: planner.Scorer,
     config: ClearConfig,
+    partial: resume.Partial,
     *,
     seed: int,
-) -> None:
-    """Act on every instance until all have ended; results are left in the instances.
+) -> list[Instance]:
+    """Act on every instance until all have ended.
 
     Args:
-      instances: settled tables; changed in place.
+      instances: settled tables; changed in place, or replaced by those of an interrupted evaluation.
       engine: physics.
       predictor: where everything goes.
       scorer: which grasps hold.
       config: the rule.
+      partial: where an interrupted evaluation is kept.
       seed: of the push candidates.
+
+    Returns:
+      The instances, ended.
     """
     if config.method not in ("dipn+gn", "gn"):
         raise UserError(f"--method {config.method}: want dipn+gn or gn")
-    key = jax.random.key(seed)
     total = sum(instance.objects for instance in instances)
-    with console.Progress("clear", total, unit="objects") as progress:
+    turn, instances = partial.load((0, instances))
+    with console.Progress("clear", total, unit="objects", done=sum(i.removed for i in instances)) as progress:
         while active := [instance for instance in instances if not instance.ended]:
             before = sum(instance.removed for instance in instances)
-            key, step = jax.random.split(key)
+            step = jax.random.fold_in(jax.random.key(seed), turn)
             decisions = [
                 _decide(jax.random.fold_in(step, i), instance, predictor, scorer, config)
                 for i, instance in enumerate(active)
@@ -129,9 +134,12 @@ def clear(
                 _grasp(grasping, engine)
             for instance in active:
                 instance.ended = _ended(instance)
+            turn += 1
+            partial.save((turn, instances))
             removed = sum(instance.removed for instance in instances) - before
             done = len(instances) - sum(not instance.ended for instance in instances)
             progress.advance(removed, f"{done}/{len(instances)} tables ended")
+    return instances
 
 
 def _decide(

@@ -11,14 +11,15 @@ import tyro
 
 from dipn_jax import console, scenes
 from dipn_jax.physics import EngineName, make_engine
-from eval import clearing, grasping, metrics, prediction
+from eval import clearing, grasping, metrics, prediction, resume
 from eval import report as reporting
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
 
-def _finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any]) -> None:
+def _finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], partial: resume.Partial) -> None:
     metrics.write(out, values, settings={k: str(v) if isinstance(v, pathlib.Path) else v for k, v in settings.items()})
+    partial.finish()
     for name, value in values.items():
         console.say(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")
 
@@ -47,12 +48,13 @@ def predict(
     """
     settings = dict(locals())
     console.require_positive(scenes=scenes_)
+    config, partial = scenes.parse_objects(objects), resume.Partial(out, settings)
     values, films = prediction.evaluate(
-        push_net, make_engine(engine), scenes.parse_objects(objects), scenes=scenes_, seed=seed, physics=physics
+        push_net, make_engine(engine), config, partial, scenes=scenes_, seed=seed, physics=physics
     )
     out.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(out / "films.npz", **films)  # type: ignore[arg-type]
-    _finish(out, values, settings)
+    _finish(out, values, settings, partial)
 
 
 def grasp(
@@ -77,8 +79,9 @@ def grasp(
     """
     settings = dict(locals())
     console.require_positive(scenes=scenes_)
-    config = scenes.parse_objects(objects)
-    _finish(out, grasping.evaluate(grasp_net, make_engine(engine), config, scenes=scenes_, seed=seed), settings)
+    config, partial = scenes.parse_objects(objects), resume.Partial(out, settings)
+    values = grasping.evaluate(grasp_net, make_engine(engine), config, partial, scenes=scenes_, seed=seed)
+    _finish(out, values, settings, partial)
 
 
 def clear(
@@ -133,9 +136,10 @@ def clear(
         tables = clearing.random_instances(physics, scene_config, count=instances, seed=seed)
     else:
         tables = clearing.hard_instances(physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed)
-    clearing.clear(tables, physics, predictor, scorer, config, seed=seed)
+    partial = resume.Partial(out, settings)
+    tables = clearing.clear(tables, physics, predictor, scorer, config, partial, seed=seed)
     clearing.save(tables, out)
-    _finish(out, clearing.summary(tables), settings)
+    _finish(out, clearing.summary(tables), settings, partial)
 
 
 def report(

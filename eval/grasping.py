@@ -15,13 +15,19 @@ from dipn_jax.physics import Engine
 from dipn_jax.planner import Scorer
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.structs import Grasp, Scene
-from eval import metrics
+from eval import metrics, resume
 
 BINS = 10
 
 
 def evaluate(
-    grasp_net: pathlib.Path, engine: Engine, config: SceneConfig, *, scenes: int, seed: int
+    grasp_net: pathlib.Path,
+    engine: Engine,
+    config: SceneConfig,
+    partial: resume.Partial,
+    *,
+    scenes: int,
+    seed: int,
 ) -> dict[str, float]:
     """One grasp of each kind on each of `scenes` settled scenes.
 
@@ -29,6 +35,7 @@ def evaluate(
       grasp_net: run of `dipn-train grasp`.
       engine: physics.
       config: scenes.
+      partial: where an interrupted evaluation is kept.
       scenes: how many.
       seed: of the scenes and of the random grasps.
 
@@ -38,18 +45,18 @@ def evaluate(
     scorer = policy.load_scorer(grasp_net)
     held: dict[str, list[np.ndarray]] = {"gn": [], "random_foreground": []}
     scores: list[np.ndarray] = []
-    key = jax.random.key(seed)
-    done = 0
-    with console.Progress("grasping", scenes, unit="scenes") as progress:
+    done, batch, held, scores = partial.load((0, 0, held, scores))
+    with console.Progress("grasping", scenes, unit="scenes", done=done) as progress:
         while done < scenes:
-            key, drop, aim = jax.random.split(key, 3)
+            drop, aim = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch))
             items = clutter.settled_exactly(drop, engine, config, min(clutter.BATCH, scenes - done))
             best, best_score, anywhere = _choose(scorer, aim, items.scene, items.poses)
             for name, grasps in (("gn", best), ("random_foreground", anywhere)):
                 _, outcome = primitives.grasp(engine, items.scene, items.poses, grasps)
                 held[name].append(np.asarray(outcome.success))
             scores.append(np.asarray(best_score))
-            done += len(items.fault)
+            done, batch = done + len(items.fault), batch + 1
+            partial.save((done, batch, held, scores))
             progress.advance(len(items.fault))
     result: dict[str, float] = {"attempts": done}
     for name, parts in held.items():

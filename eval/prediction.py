@@ -29,13 +29,23 @@ from dipn_jax.planner import Predictor
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.structs import Observation, Push, Scene
 from dipn_jax.workspace import PUSH_STEPS
+from eval import resume
 
 DISTANCES = (5, 10)
 """Centimetres at which errors are reported."""
+FILMS = 6
+"""Pushes kept as pictures."""
 
 
 def evaluate(
-    push_net: pathlib.Path, engine: Engine, config: SceneConfig, *, scenes: int, seed: int, physics: bool
+    push_net: pathlib.Path,
+    engine: Engine,
+    config: SceneConfig,
+    partial: resume.Partial,
+    *,
+    scenes: int,
+    seed: int,
+    physics: bool,
 ) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Errors of every predictor on held-out scenes, one push each.
 
@@ -43,6 +53,7 @@ def evaluate(
       push_net: run of `dipn-train push`.
       engine: what truth is.
       config: scenes.
+      partial: where an interrupted evaluation is kept.
       scenes: how many.
       seed: of the scenes and pushes.
       physics: also roll the engine out with nominal mass and friction.
@@ -59,20 +70,18 @@ def evaluate(
     measure = {name: _measurer(predictor, slots) for name, predictor in predictors.items()}
     rows: dict[str, list[np.ndarray]] = {}
     films: list[dict[str, np.ndarray]] = []
-    key = jax.random.key(seed)
-    done = 0
-    with console.Progress("prediction", scenes, unit="pushes") as progress:
+    done, batch, rows, films = partial.load((0, 0, rows, films))
+    with console.Progress("prediction", scenes, unit="pushes", done=done) as progress:
         while done < scenes:
-            key, drop, aim = jax.random.split(key, 3)
+            drop, aim = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch))
             items = clutter.settled_exactly(drop, engine, config, min(clutter.BATCH, scenes - done))
             pushes, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)
             keep = np.asarray(feasible)
             items, pushes = records.take(items, keep), records.take(pushes, keep)
             truth = np.asarray(primitives.push(engine, items.scene, items.poses, pushes).poses)
-            nominal = _nominal(items.scene) if physics else None
-            imagined = (
-                np.asarray(primitives.push(engine, nominal, items.poses, pushes).poses) if nominal is not None else None
-            )
+            rolled = None
+            if physics:
+                rolled = np.asarray(primitives.push(engine, _nominal(items.scene), items.poses, pushes).poses)
             for i in range(len(pushes.angle)):
                 scene, push = records.take(items.scene, i), records.take(pushes, i)
                 for centimetres in DISTANCES:
@@ -80,13 +89,14 @@ def evaluate(
                     arrays = (scene, push, truth[i, 0], truth[i, centimetres])
                     for name, function in measure.items():
                         _record(rows, name, centimetres, function(*arrays))
-                    if imagined is not None:
-                        rolled = _measure_rollout(*arrays, imagined[i, centimetres], slots=slots)
-                        _record(rows, "physics", centimetres, rolled)
-                if len(films) < 6:
+                    if rolled is not None:
+                        errors = _measure_rollout(*arrays, rolled[i, centimetres], slots=slots)
+                        _record(rows, "physics", centimetres, errors)
+                if len(films) < FILMS:
                     films.append(_film(scene, push, truth[i], predictors["dipn"], slots))
                 progress.advance(1)
-            done += len(pushes.angle)
+            done, batch = done + len(pushes.angle), batch + 1
+            partial.save((done, batch, rows, films))
     names = [*measure, *(["physics"] if physics else [])]
     return _summary(rows, names), {k: np.stack([film[k] for film in films]) for k in films[0]}
 

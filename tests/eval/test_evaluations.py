@@ -1,5 +1,6 @@
 """Every evaluation on a tiny scale, with networks that have learnt nothing; and the arithmetic of the figures."""
 
+import copy
 import json
 import pathlib
 from typing import Any
@@ -12,6 +13,7 @@ from dipn_jax import checkpoint, policy, scenes
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from eval import clearing, grasping, metrics, prediction, report
+from eval.resume import Partial
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
@@ -63,8 +65,12 @@ def test_summary_counts_as_the_paper_does() -> None:
     assert values["pushes"] == 2 and values["ended_pushed_out"] == 1
 
 
-def test_prediction_measures_the_baselines_as_they_are(engine: Any, runs: dict[str, pathlib.Path]) -> None:
-    values, films = prediction.evaluate(runs["dipn"], engine, CONFIG, scenes=6, seed=3, physics=True)
+def test_prediction_measures_the_baselines_as_they_are(
+    engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
+) -> None:
+    values, films = prediction.evaluate(
+        runs["dipn"], engine, CONFIG, Partial(tmp_path, {}), scenes=6, seed=3, physics=True
+    )
     assert values["pushes"] == 6 and len(films["before"]) > 0
     # the engine with nominal mass and friction is nearer to the truth than nothing-moves
     assert values["push_error/physics/10cm/moved"] < values["push_error/static/10cm/moved"]
@@ -73,8 +79,10 @@ def test_prediction_measures_the_baselines_as_they_are(engine: Any, runs: dict[s
         assert np.isfinite(value), key
 
 
-def test_grasp_evaluation_writes_what_it_promises(engine: Any, runs: dict[str, pathlib.Path]) -> None:
-    values = grasping.evaluate(runs["grasp"], engine, CONFIG, scenes=3, seed=3)
+def test_grasp_evaluation_writes_what_it_promises(
+    engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
+) -> None:
+    values = grasping.evaluate(runs["grasp"], engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3)
     assert values["attempts"] == 3
     for name in ("gn", "random_foreground"):
         assert 0 <= values[f"grasp_success/{name}_low"] <= values[f"grasp_success/{name}"] <= 1
@@ -87,7 +95,20 @@ def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest
     tables = clearing.hard_instances(engine, scenes.hard_cases_path(), ["06", "10"], slots=6, repeats=1, seed=0)
     config = clearing.ClearConfig(candidates=4, threshold=2.0, gamma=1.05)
     predictor, scorer = policy.load_predictor(runs["dipn"], 6), policy.load_scorer(runs["grasp"])
-    clearing.clear(tables, engine, predictor, scorer, config, seed=0)
+    # interrupted after the second turn, then taken up by a fresh call
+    partial = Partial(out, {})
+    save = partial.save
+
+    def stop_at_two(state: Any) -> None:
+        save(state)
+        if state[0] == 2:
+            raise KeyboardInterrupt
+
+    partial.save = stop_at_two  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        clearing.clear(copy.deepcopy(tables), engine, predictor, scorer, config, partial, seed=0)
+    tables = clearing.clear(tables, engine, predictor, scorer, config, Partial(out, {}), seed=0)
+    assert Partial(out, {"other": 1}).load("fresh") == "fresh"
     clearing.save(tables, out)
     metrics.write(out, clearing.summary(tables), settings={})
     return tables, out
@@ -108,7 +129,9 @@ def test_every_table_ends_by_the_rules(cleared: Any) -> None:
 def test_the_report_is_one_file_with_its_pictures(
     cleared: Any, engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
-    values, films = prediction.evaluate(runs["dipn"], engine, CONFIG, scenes=2, seed=3, physics=False)
+    values, films = prediction.evaluate(
+        runs["dipn"], engine, CONFIG, Partial(tmp_path, {}), scenes=2, seed=3, physics=False
+    )
     (tmp_path / "p").mkdir()
     np.savez_compressed(tmp_path / "p" / "films.npz", **films)  # type: ignore[arg-type]
     metrics.write(tmp_path / "p", values, settings={})
