@@ -24,7 +24,7 @@ def push(
     seed: int = 0,
     actions: int = 3,
     shard_size: int = 500,
-    engine: EngineName = "native",
+    engine: EngineName = "auto",
     timestep: float | None = None,
     shard: int = 0,
     of: int = 1,
@@ -57,7 +57,7 @@ def grasp(
     seed: int = 0,
     actions: int = 6,
     shard_size: int = 600,
-    engine: EngineName = "native",
+    engine: EngineName = "auto",
     timestep: float | None = None,
     shard: int = 0,
     of: int = 1,
@@ -89,7 +89,7 @@ def images(
     objects: Objects = "10",
     seed: int = 0,
     shard_size: int = 100,
-    engine: EngineName = "native",
+    engine: EngineName = "auto",
     timestep: float | None = None,
     shard: int = 0,
     of: int = 1,
@@ -127,15 +127,15 @@ def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
 
 
 def repair(folder: tyro.conf.Positional[pathlib.Path]) -> None:
-    """Delete damaged shards and rebuild the manifest; the command that made the data set then fills the gaps.
+    """Set damaged shards aside and rebuild the manifest; the command that made the data set then fills the gaps.
 
     Args:
       folder: a data set.
     """
-    if not folder.is_dir():
-        raise UserError(f"data set {folder}: no such folder; give a folder that dipn-datagen wrote")
     removed = records.repair(folder)
-    console.say(f"{folder}: {len(removed)} damaged shards removed {[p.name for p in removed]}; generate again to fill")
+    console.say(
+        f"{folder}: {len(removed)} damaged shards set aside {[p.name for p in removed]}; generate again to fill"
+    )
 
 
 def info(folder: tyro.conf.Positional[pathlib.Path]) -> None:

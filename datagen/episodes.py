@@ -22,9 +22,6 @@ from dipn_jax.structs import (
 )
 from dipn_jax.workspace import PUSH_STEPS
 
-UNUSABLE = Fault.NON_FINITE | Fault.CAPACITY | Fault.SPEED | Fault.PENETRATION
-"""Faults of an action that drop the episode: the simulation is wrong. Others are physics and stay, flagged."""
-
 
 @dataclasses.dataclass
 class Batch:
@@ -107,7 +104,7 @@ def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, c
 def _drop_unusable(episodes: Any, counts: dict[str, int]) -> Batch:
     fault = episodes.fault
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})
-    good = (fault & UNUSABLE) == 0
+    good = (fault & Fault.UNUSABLE) == 0
     return Batch(records.take(episodes, good) if good.any() else None, counts)
 
 

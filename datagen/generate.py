@@ -18,6 +18,8 @@ from dipn_jax.scenes import SceneConfig
 
 MAX_ATTEMPTS = 100
 """Batches without a single usable episode before giving up."""
+MAX_ACTIONS = 256
+"""Actions tried on one scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,13 +40,17 @@ class Job:
         return -(-self.episodes // self.shard_size)
 
     def describe(self) -> dict[str, Any]:
-        """As JSON, in each shard's metadata and beside the shards; the number of episodes may grow."""
+        """As JSON, beside the shards."""
         return json.loads(json.dumps(dataclasses.asdict(self)))
+
+    def size(self, index: int) -> int:
+        """Episodes of shard `index`."""
+        return min(self.shard_size, self.episodes - index * self.shard_size)
 
 
 def shard(job: Job, index: int, engine: Engine, progress: console.Progress) -> tuple[Any, dict[str, int]]:
     """The episodes of one shard and what was counted while making them."""
-    want = min(job.shard_size, job.episodes - index * job.shard_size)
+    want = job.size(index)
     key = jax.random.fold_in(jax.random.key(job.seed), index)
     done: list[Any] = []
     counts: collections.Counter[str] = collections.Counter()
@@ -62,7 +68,7 @@ def shard(job: Job, index: int, engine: Engine, progress: console.Progress) -> t
             fresh = min(len(batch.episodes.fault), want - have)
             done.append(records.take(batch.episodes, slice(0, fresh)))
             have += fresh
-            progress.advance(fresh, f"{counts['dropped_scenes']} scenes dropped")
+            progress.advance(fresh, f"{counts['dropped_scenes']} scenes let fall")
     return records.concatenate(done), dict(counts)
 
 
@@ -73,45 +79,43 @@ def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1) -> None
       UserError: the folder holds a data set of another config.
     """
     console.require_positive(episodes=job.episodes, shard_size=job.shard_size, actions=job.actions, of=of)
+    console.require_between(1, MAX_ACTIONS, actions=job.actions)
+    console.require_seed(job.seed)
+    console.require_out(out)
     if not 0 <= part < of:
         raise UserError(f"--shard {part} --of {of}: want 0 <= shard < of")
     job = dataclasses.replace(job, engine=resolve(job.engine))
     engine = make_engine(job.engine, timestep=job.timestep)
-    _check_same(job, out)
-    todo = [i for i in range(part, job.shards(), of) if not _written(out, i, job)]
+    _claim(job, out)
+    # the content of a shard does not depend on how many others there are
+    config = {key: value for key, value in job.describe().items() if key != "episodes"}
     mine = range(part, job.shards(), of)
-    size = lambda i: min(job.shard_size, job.episodes - i * job.shard_size)  # noqa: E731
-    total = sum(size(i) for i in mine)
-    with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(size, todo))) as progress:
+    todo = [index for index in mine if not _written(out, index, job)]
+    total = sum(map(job.size, mine))
+    with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
         for index in todo:
             made, counts = shard(job, index, engine, progress)
-            records.write_shard(out, index, made, kind=job.kind, config=job.describe(), faults=counts)
+            records.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
             records.update_manifest(out)
     manifest = records.update_manifest(out)
     console.say(f"{out}: {manifest['episodes']} {job.kind} episodes in {len(manifest['shards'])} shards")
 
 
 def _written(out: pathlib.Path, index: int, job: Job) -> bool:
+    """Whether shard `index` is there with all its episodes; one that is too short is made anew."""
     path = records.shard_path(out, index)
-    if not path.exists():
-        return False
-    meta = records.read_meta(path)
-    return meta["config"]["episodes"] == job.episodes or (index + 1) * job.shard_size <= min(
-        job.episodes, meta["config"]["episodes"]
-    )
+    return path.exists() and records.count(path) == job.size(index)
 
 
-def _check_same(job: Job, out: pathlib.Path) -> None:
-    """A folder holds one config; more episodes of it may be asked for later."""
+def _claim(job: Job, out: pathlib.Path) -> None:
+    """A folder holds one config; more episodes of it may be asked for later, not fewer."""
+    records.claim(out, job.describe() | {"episodes": max(job.episodes, _begun_with(out))}, free=("episodes",))
+    if job.episodes < _begun_with(out):
+        raise UserError(
+            f"{out}: begun with {_begun_with(out)} episodes, asked for {job.episodes}; give another --out, or as many"
+        )
+
+
+def _begun_with(out: pathlib.Path) -> int:
     path = out / "config.json"
-    mine = job.describe()
-    if path.exists():
-        theirs = json.loads(path.read_text())
-        different = [k for k in mine if k != "episodes" and theirs.get(k) != mine[k]]
-        if different:
-            key = different[0]
-            raise UserError(
-                f"{out}: holds a data set with {key}={theirs.get(key)}, asked for {key}={mine[key]}; "
-                "give another --out or the same config"
-            )
-    records.write_json(path, mine)
+    return int(records.read_json(path).get("episodes", 0)) if path.exists() else 0

@@ -130,3 +130,10 @@ def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Gr
     width = observation.label.shape[1]
     rotation = jax.random.randint(angle_key, (count,), 0, ROTATIONS)
     return grasp_at(jnp.stack([rotation, pixel // width, pixel % width], -1), observation.height)
+
+
+def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The best of scores `[16, H, W]`: index `[3]` (rotation, row, col) and its score."""
+    flat = jnp.argmax(scores)
+    index = jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
+    return index, scores.reshape(-1)[flat]

@@ -81,7 +81,8 @@ def save(
     records.write_json(temporary / "meta.json", meta)
     shutil.rmtree(final, ignore_errors=True)
     temporary.rename(final)
-    for old in _steps(run)[keep:]:
+    older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
+    for old in older[keep - 1 :]:
         shutil.rmtree(old)
 
 
@@ -90,9 +91,10 @@ def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
     try:
         meta = json.loads((folder / "meta.json").read_text())
         good = all(records.file_sha256(folder / name) == digest for name, digest in meta["sha256"].items())
-    except (OSError, ValueError, KeyError):
+        good = good and meta["format_version"] == FORMAT_VERSION and meta["network"] in NETWORKS
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return meta if good and meta.get("format_version") == FORMAT_VERSION else None
+    return meta if good else None
 
 
 def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:

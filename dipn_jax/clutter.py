@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from dipn_jax import primitives, records, render, scenes
+from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Array, Fault, Observation, Scene, SettledScene
 
 BATCH = 64
 """Scenes that compiled functions take at a time."""
+MAX_DROPS = 128
+"""Drops in a row without a usable scene before giving up."""
 
 
 def settled(
@@ -40,11 +43,22 @@ def settled(
 
 
 def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
-    """`count` scenes at rest, however many drops it takes."""
+    """`count` scenes at rest, however many drops it takes.
+
+    Raises:
+      UserError: `MAX_DROPS` drops in a row gave none.
+    """
     kept: list[SettledScene] = []
+    in_vain = 0
     while (missing := count - sum(len(batch.fault) for batch in kept)) > 0:
         key, drop = jax.random.split(key)
-        batch, _ = settled(drop, engine, config, min(BATCH, int(1.2 * missing) + 2))
+        tries = min(BATCH, int(1.2 * missing) + 2)
+        batch, counts = settled(drop, engine, config, tries)
+        in_vain = 0 if len(batch.fault) else in_vain + tries
+        if in_vain >= MAX_DROPS:
+            raise UserError(
+                f"scenes: {in_vain} drops, none at rest inside the workspace ({counts}); ask for fewer objects"
+            )
         kept.append(records.take(batch, slice(0, missing)))
     return records.concatenate(kept)
 

@@ -1,10 +1,11 @@
 """What the three commands share with a terminal: progress, one-line errors, the compilation cache.
 
-One of the two modules of the library that print or know folders of the machine (the other is `checkpoint`).
+The only module of the library that prints, and with `records` and `checkpoint` the only ones that know folders.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import pathlib
 import signal
@@ -95,10 +96,57 @@ def say(text: str) -> None:
 
 
 def require_positive(**values: float) -> None:
-    """UserError for the first value that is not above zero."""
+    """UserError for the first value that is not a finite number above zero."""
     for name, value in values.items():
-        if value <= 0:
-            raise UserError(f"--{name.replace('_', '-')} {value}: want a number above 0")
+        if not (math.isfinite(value) and value > 0):
+            raise UserError(f"{_option(name)} {value}: want a number above 0")
+
+
+def require_between(low: float, high: float, **values: float) -> None:
+    """UserError for the first value outside [low, high]."""
+    for name, value in values.items():
+        if not low <= value <= high:
+            raise UserError(f"{_option(name)} {value}: want {low} to {high}")
+
+
+def require_seed(seed: int) -> None:
+    """UserError for a seed that is not an unsigned 32-bit number."""
+    require_between(0, 2**32 - 1, seed=seed)
+
+
+def require_out(out: pathlib.Path) -> None:
+    """UserError where a folder `out` cannot be made or written to; makes nothing."""
+    existing = next(p for p in (out, *out.resolve().parents) if p.exists())
+    if not existing.is_dir():
+        raise UserError(f"--out {out}: {existing} is not a folder; give another")
+    if not os.access(existing, os.W_OK):
+        raise UserError(f"--out {out}: {existing} cannot be written to; give another")
+
+
+def _option(name: str) -> str:
+    return f"--{name.rstrip('_').replace('_', '-')}"
+
+
+class Interruption:
+    """Within it, the first SIGINT or SIGTERM only sets `requested`; a second one acts as usual."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._old: dict[int, Any] = {}
+
+    def __enter__(self) -> Interruption:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._old[number] = signal.signal(number, self._request)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _request(self, *_: object) -> None:
+        self.requested = True
+        self.__exit__()
 
 
 def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | None = None) -> int:
@@ -117,6 +165,11 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
         )
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(
+            f"error: {error.filename or 'files'}: {error.strerror or error}; mend that and try again", file=sys.stderr
+        )
         return 2
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from here", file=sys.stderr)

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 
 from dipn_jax import candidates, imagine, render
-from dipn_jax.networks.grasp import best_grasp
 from dipn_jax.structs import Decision, Observation, Push
 
 Predictor = Callable[[Observation, Push], jax.Array]
@@ -53,7 +52,7 @@ def decide(
       exceeds the mean score now; a push that would move any centre out of the workspace is dropped.
     """
     now = scorer(render.rgbd(observation)[None])[0]
-    index, best_score = best_grasp(now)
+    index, best_score = candidates.best_grasp(now)
     pushes, feasible = candidates.sample_pushes(key, observation, count=count, slots=slots, distance=distance)
     centers, area = candidates.mask_centers(observation.label, slots)
 

@@ -9,6 +9,7 @@ synced and renamed, so a file with a shard's name is whole or was damaged later,
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import hashlib
 import importlib.metadata
 import json
@@ -23,6 +24,11 @@ import pyarrow.parquet as pq
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
+
+
+class DamagedShard(UserError):
+    """A file that was a shard, or has a shard's name, and cannot be read as one."""
+
 
 SCHEMA_VERSION = 1
 KINDS: dict[str, type] = {
@@ -64,16 +70,60 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
     """Write under a temporary name, sync, rename."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.rename(path)
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.rename(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:
     """Write JSON atomically, keys in the given order."""
-    write_atomically(path, (json.dumps(value, indent=1) + "\n").encode())
+    write_atomically(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
+    """A JSON file.
+
+    Raises:
+      UserError: it is missing, is not JSON, or is not a `wanted` at its top.
+    """
+    try:
+        value = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
+    except (OSError, ValueError):
+        raise UserError(f"{path}: damaged, not JSON; delete it or give another folder") from None
+    if not isinstance(value, wanted):
+        raise UserError(f"{path}: holds a {type(value).__name__}, want a {wanted.__name__}; give another folder")
+    return value
+
+
+def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = ()) -> None:
+    """Write `out/config.json`, or check that the folder was begun with the same one.
+
+    Args:
+      out: folder of a data set or a run.
+      identity: JSON-able, flat: everything the content depends on.
+      free: keys that may change.
+
+    Raises:
+      UserError: the folder was begun with something else.
+    """
+    path, mine = out / "config.json", json.loads(json.dumps(identity))
+    if path.exists():
+        theirs = read_json(path)
+        different = [key for key in mine if key not in free and theirs.get(key) != mine[key]]
+        if different:
+            key = different[0]
+            raise UserError(
+                f"{out}: begun with {key}={theirs.get(key)}, asked for {key}={mine[key]}; give another --out, or the "
+                "same options and data to go on"
+            )
+    write_json(path, mine)
 
 
 def _columns(episodes: Any) -> dict[str, np.ndarray]:
@@ -112,7 +162,7 @@ def write_shard(
     table = pa.Table.from_arrays(arrays, names=list(columns))
     table = table.replace_schema_metadata({_META: json.dumps(meta).encode()})
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
     write_atomically(shard_path(folder, index), sink.getvalue().to_pybytes())
 
 
@@ -127,7 +177,7 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise UserError(f"shard {path}: not found; generate it again with dipn-datagen") from None
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
-        raise UserError(
+        raise DamagedShard(
             f"shard {path}: truncated, damaged or not a shard of this project; run dipn-datagen repair {path.parent}"
         ) from None
     if meta["schema_version"] != SCHEMA_VERSION:
@@ -135,6 +185,12 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
             f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it again"
         )
     return meta
+
+
+def count(path: pathlib.Path) -> int:
+    """Episodes in a shard."""
+    read_meta(path)
+    return pq.read_metadata(path).num_rows
 
 
 def read_shard(path: pathlib.Path, *, kind: str) -> Any:
@@ -147,9 +203,9 @@ def read_shard(path: pathlib.Path, *, kind: str) -> Any:
     if meta["kind"] != kind:
         raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(path, page_checksum_verification=True)
     except (pa.ArrowException, OSError):
-        raise UserError(f"shard {path}: damaged; run dipn-datagen repair {path.parent}") from None
+        raise DamagedShard(f"shard {path}: damaged; run dipn-datagen repair {path.parent}") from None
     columns = {}
     for name, spec in meta["columns"].items():
         flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
@@ -171,8 +227,15 @@ def _assemble(struct: type, columns: dict[str, np.ndarray], prefix: str = "") ->
 def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """Account for every readable shard of the folder in `manifest.json`; returns it.
 
-    Entries of shards that are gone are dropped; a shard that is listed already is not read again.
+    Entries of shards that are gone are dropped; a shard that is listed already is not read again. Workers that
+    share the folder take turns.
     """
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _rebuild_manifest(folder)
+
+
+def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
     known = _read_manifest(folder)["shards"] if (folder / MANIFEST).exists() else {}
     shards: dict[str, Any] = {}
     for path in sorted(folder.glob("shard-*.parquet")):
@@ -180,7 +243,7 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
         if entry is None or entry["bytes"] != path.stat().st_size:
             meta = read_meta(path)
             entry = {
-                "episodes": pq.read_metadata(path).num_rows,
+                "episodes": count(path),
                 "bytes": path.stat().st_size,
                 "sha256": file_sha256(path),
                 "kind": meta["kind"],
@@ -202,9 +265,9 @@ def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text())
         manifest["shards"].items()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"data set {folder}: no {MANIFEST}; give a folder that dipn-datagen wrote") from None
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise UserError(f"data set {folder}: {MANIFEST} is damaged; run dipn-datagen repair {folder}") from None
     return manifest
 
@@ -226,7 +289,13 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
 
 
 def repair(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Delete shards that are damaged, and rebuild the manifest from the rest; returns what was deleted."""
+    """Set damaged shards aside as `*.damaged`, and rebuild the manifest from the rest; returns what was set aside.
+
+    Raises:
+      UserError: the folder is no data set, or holds shards of another schema version, which are not damaged.
+    """
+    if not (folder / "config.json").is_file() and not (folder / MANIFEST).is_file():
+        raise UserError(f"data set {folder}: no such data set; give a folder that dipn-datagen wrote")
     try:
         known = _read_manifest(folder)["shards"]
     except UserError:
@@ -236,10 +305,10 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
         try:
             read_shard(path, kind=read_meta(path)["kind"])
             good = path.name not in known or file_sha256(path) == known[path.name]["sha256"]
-        except UserError:
+        except DamagedShard:
             good = False
         if not good:
-            path.unlink()
+            path.rename(path.with_suffix(".parquet.damaged"))
             removed.append(path)
     (folder / MANIFEST).unlink(missing_ok=True)
     update_manifest(folder)

@@ -69,7 +69,10 @@ def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixe
     side = min(WINDOW, pixels)
     upper, lower = _bounds(scene, poses)
     middle = (pixels - 1) / 2
-    corner = jnp.floor(poses[:, :2] / WORKSPACE.pixel + middle - side / 2 + 1).astype(jnp.int32)
+    # about the middle of the bounding box, which the centre of mass is not
+    offset = jnp.asarray(shapes.UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(scene.shape, 0)] * scene.size
+    box = poses[:, :3] - jnp.einsum("nij,nj->ni", geometry.quat_to_matrix(poses[:, 3:]), offset)
+    corner = jnp.floor(box[:, :2] / WORKSPACE.pixel + middle - side / 2 + 1).astype(jnp.int32)
     corner = jnp.clip(jnp.nan_to_num(corner), 0, pixels - side)
 
     def paint(i: jax.Array, maps: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

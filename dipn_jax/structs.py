@@ -33,6 +33,9 @@ class Fault:
     PENETRATION = 32  # an object sank into the table
     SHORT = 64  # the gripper did not reach its commanded pose
 
+    UNUSABLE = NON_FINITE | CAPACITY | SPEED | PENETRATION
+    """The simulation went wrong; the other faults are physics (a roll, an object off the table) or the gripper's."""
+
     NAMES: ClassVar[dict[int, str]] = {
         1: "non_finite",
         2: "capacity",

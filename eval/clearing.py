@@ -12,7 +12,7 @@ import numpy as np
 from dipn_jax import candidates, clutter, console, planner, policy, primitives, records, render, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
-from dipn_jax.structs import Decision, Observation, Push, Scene
+from dipn_jax.structs import Decision, Fault, Observation, Push, Rollout, Scene
 from dipn_jax.workspace import WORKSPACE
 from eval import metrics, resume
 
@@ -42,6 +42,7 @@ class Instance:
     grasps: int = 0
     pushes: int = 0
     removed: int = 0
+    held: int = 0  # grasps that held something
     ended: str = ""  # cleared, pushed out, out of actions, fault
     film: list[dict[str, Any]] = dataclasses.field(default_factory=list)
 
@@ -74,6 +75,14 @@ def hard_instances(
         mass=(scene.mass * factor).astype(np.float32), friction=(scene.friction * rub).astype(np.float32)
     )
     rollout = primitives.settle(engine, scene, poses)
+    wrong = np.flatnonzero(np.asarray(rollout.fault) & (Fault.UNUSABLE | Fault.OUTSIDE))
+    if len(wrong):
+        first = wrong[0]
+        what = [name for name, hit in Fault.count(rollout.fault[first : first + 1]).items() if hit]
+        raise UserError(
+            f"case {found[index[first]]} of {path}: does not come to rest in the workspace ({', '.join(what)}); "
+            "objects that overlap or stand at its edge must be moved"
+        )
     return _instances([found[i] for i in index], scene, np.asarray(rollout.poses)[:, -1])
 
 
@@ -133,7 +142,7 @@ def clear(
             if grasping:
                 _grasp(grasping, engine)
             for instance in active:
-                instance.ended = _ended(instance)
+                instance.ended = instance.ended or _ended(instance)
             turn += 1
             partial.save((turn, instances))
             removed = sum(instance.removed for instance in instances) - before
@@ -172,8 +181,10 @@ def _push(rows: Acting, engine: Engine) -> None:
     scene, poses = _stack(rows)
     pushes: Push = jax.tree.map(lambda *leaves: np.stack(leaves), *[decision.push for _, _, decision in rows])
     rollout = primitives.push(engine, scene, poses, pushes)
+    wrong = _went_wrong(rollout)
     for i, (instance, seen, decision) in enumerate(rows):
         instance.pushes += 1
+        instance.ended = "fault" if wrong[i] else ""
         instance.poses = np.asarray(rollout.poses)[i, -1]
         _remember(instance, seen, decision, "push")
 
@@ -185,12 +196,20 @@ def _grasp(rows: Acting, engine: Engine) -> None:
     rollout, outcome = primitives.grasp(engine, scene, poses, grasps)
     held, after = np.asarray(outcome.held), np.asarray(rollout.poses)[:, -1]
     scene, after = jax.device_get(scenes.remove(scene, after, held))
-    rested = np.asarray(primitives.settle(engine, scene, after, duration=primitives.RESETTLE_TIME).poses)[:, -1]
+    rest = primitives.settle(engine, scene, after, duration=primitives.RESETTLE_TIME)
+    rested, wrong = np.asarray(rest.poses)[:, -1], _went_wrong(rollout) | _went_wrong(rest)
     for i, (instance, seen, decision) in enumerate(rows):
         instance.grasps += 1
+        instance.held += bool(held[i].any())
+        instance.ended = "fault" if wrong[i] else ""
         instance.removed += int(held[i].sum())
         instance.scene, instance.poses = records.take(scene, i), rested[i]
         _remember(instance, seen, decision, "grasp held" if held[i].any() else "grasp missed")
+
+
+def _went_wrong(rollout: Rollout) -> np.ndarray:
+    """Which simulations `[B]` cannot be believed."""
+    return (np.asarray(rollout.fault) & Fault.UNUSABLE) != 0
 
 
 def _remember(instance: Instance, seen: Observation, decision: Decision, what: str) -> None:
@@ -215,8 +234,6 @@ def _bytes(color: Any) -> np.ndarray:
 
 def _ended(instance: Instance) -> str:
     present = instance.scene.shape >= 0
-    if not np.isfinite(instance.poses).all():
-        return "fault"
     if (np.abs(instance.poses[present, :2]) > WORKSPACE.half).any():
         return "pushed out"
     if not present.any():
@@ -228,16 +245,19 @@ def summary(instances: list[Instance]) -> dict[str, Any]:
     """Flat metrics, each with a bootstrap 95 % interval over instances (`_low`, `_high`).
 
     As in the paper: completion is instances cleared over instances, grasp success is objects grasped over grasp
-    actions, efficiency is objects removed over all actions; the last two over all instances and over completed ones.
+    actions, efficiency is objects removed over all actions; the last two over all instances and over completed ones,
+    summed before they are divided. A grasp may lift two objects, so `grasps_that_held` stands beside.
     """
     done = np.array([instance.ended == "cleared" for instance in instances])
     removed = np.array([instance.removed for instance in instances])
+    held = np.array([instance.held for instance in instances])
     grasps = np.array([instance.grasps for instance in instances])
     actions = np.array([instance.actions for instance in instances])
     rows = {
         "completion": (done, np.ones(len(done))),
         "grasp_success_all": (removed, grasps),
         "grasp_success_completed": (removed * done, grasps * done),
+        "grasps_that_held": (held, grasps),
         "efficiency_all": (removed, actions),
         "efficiency_completed": (removed * done, actions * done),
     }
@@ -255,7 +275,7 @@ def save(instances: list[Instance], out: pathlib.Path) -> None:
     """Every step of every instance, as `episodes/NAME.npz` and a line of `episodes.jsonl`."""
     lines = []
     for number, instance in enumerate(instances):
-        stem = f"{number:03d}-{instance.name}"
+        stem = f"{number:03d}"
         (out / "episodes").mkdir(parents=True, exist_ok=True)
         arrays: dict[str, Any] = {
             key: np.stack([step[key] for step in instance.film]) for key in instance.film[0] if key != "what"

@@ -17,6 +17,15 @@ from eval import report as reporting
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
 
+MAX_CANDIDATES = 4096
+
+
+def _check(out: pathlib.Path, seed: int, **counts: int) -> None:
+    console.require_positive(**counts)
+    console.require_seed(seed)
+    console.require_out(out)
+
+
 def _finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], partial: resume.Partial) -> None:
     metrics.write(out, values, settings={k: str(v) if isinstance(v, pathlib.Path) else v for k, v in settings.items()})
     partial.finish()
@@ -30,7 +39,7 @@ def predict(
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 300,
     objects: Objects = "1:7",
     seed: int = 1_000_000,
-    engine: EngineName = "native",
+    engine: EngineName = "auto",
     physics: bool = True,
 ) -> None:
     """Error of the predicted masks after 5 and 10 cm of a push, on scenes never trained on.
@@ -47,8 +56,9 @@ def predict(
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
     """
     settings = dict(locals())
-    console.require_positive(scenes=scenes_)
-    config, partial = scenes.parse_objects(objects), resume.Partial(out, settings)
+    _check(out, seed, scenes=scenes_)
+    config = scenes.parse_objects(objects)
+    partial = resume.Partial(out, settings, inputs=[push_net])
     values, films = prediction.evaluate(
         push_net, make_engine(engine), config, partial, scenes=scenes_, seed=seed, physics=physics
     )
@@ -63,7 +73,7 @@ def grasp(
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 100,
     objects: Objects = "10",
     seed: int = 1_000_000,
-    engine: EngineName = "native",
+    engine: EngineName = "auto",
 ) -> None:
     """Success of the best-scored grasp, beside that of a random foreground pixel at a random angle.
 
@@ -78,8 +88,9 @@ def grasp(
       engine: physics.
     """
     settings = dict(locals())
-    console.require_positive(scenes=scenes_)
-    config, partial = scenes.parse_objects(objects), resume.Partial(out, settings)
+    _check(out, seed, scenes=scenes_)
+    config = scenes.parse_objects(objects)
+    partial = resume.Partial(out, settings, inputs=[grasp_net])
     values = grasping.evaluate(grasp_net, make_engine(engine), config, partial, scenes=scenes_, seed=seed)
     _finish(out, values, settings, partial)
 
@@ -98,7 +109,7 @@ def clear(
     gamma: float = 0.9,
     threshold: float = 0.7,
     seed: int = 1_000_000,
-    engine: EngineName = "native",
+    engine: EngineName = "auto",
 ) -> None:
     """Clear tables with Alg. 2: push or grasp, until nothing is left.
 
@@ -122,7 +133,10 @@ def clear(
       engine: physics.
     """
     settings = dict(locals())
-    console.require_positive(instances=instances, candidates=candidates, distance=distance)
+    _check(out, seed, instances=instances, candidates=candidates)
+    console.require_between(1, MAX_CANDIDATES, candidates=candidates)
+    console.require_between(0.01, 0.12, distance=distance)
+    console.require_between(0.0, 10.0, gamma=gamma, threshold=threshold)
     physics = make_engine(engine)
     config = clearing.ClearConfig(method, candidates, distance, gamma, threshold)
     if cases == "random":
@@ -136,7 +150,8 @@ def clear(
         tables = clearing.random_instances(physics, scene_config, count=instances, seed=seed)
     else:
         tables = clearing.hard_instances(physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed)
-    partial = resume.Partial(out, settings)
+    inputs = [p for p in (push_net, grasp_net, None if cases == "random" else path) if p is not None]
+    partial = resume.Partial(out, settings, inputs=inputs)
     tables = clearing.clear(tables, physics, predictor, scorer, config, partial, seed=seed)
     clearing.save(tables, out)
     _finish(out, clearing.summary(tables), settings, partial)
@@ -162,6 +177,7 @@ def report(
       random: --out of dipn-eval clear --cases random.
       runs: training runs, for their learning curves.
     """
+    console.require_out(out)
     values = reporting.write(out, prediction=predictions, grasp=grasps, hard=hard, random=random, runs=list(runs))
     console.say(f"{out / 'report.html'}: {len(values)} numbers, also in {out / 'metrics.json'}")
 

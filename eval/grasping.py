@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dipn_jax import candidates, clutter, console, policy, primitives, render
-from dipn_jax.networks.grasp import best_grasp
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Scorer
 from dipn_jax.scenes import SceneConfig
-from dipn_jax.structs import Grasp, Scene
+from dipn_jax.structs import Fault, Grasp, Scene
 from eval import metrics, resume
 
 BINS = 10
@@ -52,8 +51,9 @@ def evaluate(
             items = clutter.settled_exactly(drop, engine, config, min(clutter.BATCH, scenes - done))
             best, best_score, anywhere = _choose(scorer, aim, items.scene, items.poses)
             for name, grasps in (("gn", best), ("random_foreground", anywhere)):
-                _, outcome = primitives.grasp(engine, items.scene, items.poses, grasps)
-                held[name].append(np.asarray(outcome.success))
+                rollout, outcome = primitives.grasp(engine, items.scene, items.poses, grasps)
+                wrong = (np.asarray(rollout.fault) & Fault.UNUSABLE) != 0
+                held[name].append(np.where(wrong, np.nan, np.asarray(outcome.success)))
             scores.append(np.asarray(best_score))
             done, batch = done + len(items.fault), batch + 1
             partial.save((done, batch, held, scores))
@@ -61,9 +61,13 @@ def evaluate(
     result: dict[str, float] = {"attempts": done}
     for name, parts in held.items():
         success = np.concatenate(parts)
+        result[f"unusable/{name}"] = int(np.isnan(success).sum())
+        success = success[np.isfinite(success)]
         rate, low, high = metrics.ratio_interval(success, np.ones(len(success)))
         result |= {f"grasp_success/{name}": rate, f"grasp_success/{name}_low": low, f"grasp_success/{name}_high": high}
-    result["expected_calibration_error"] = calibration_error(np.concatenate(scores), np.concatenate(held["gn"]))
+    success = np.concatenate(held["gn"])
+    usable = np.isfinite(success)
+    result["expected_calibration_error"] = calibration_error(np.concatenate(scores)[usable], success[usable])
     return result
 
 
@@ -74,7 +78,7 @@ def _choose(scorer: Scorer, key: jax.Array, scene: Scene, poses: jax.Array) -> t
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Grasp, jax.Array, Grasp]:
         k, one_scene, one_poses = args
         seen = render.render(one_scene, one_poses)
-        index, score = best_grasp(scorer(render.rgbd(seen)[None])[0])
+        index, score = candidates.best_grasp(scorer(render.rgbd(seen)[None])[0])
         anywhere = jax.tree.map(lambda leaf: leaf[0], candidates.random_grasps(k, seen, count=1))
         return candidates.grasp_at(index, seen.height), score, anywhere
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 from typing import Any
 
 import numpy as np
 
 from dipn_jax import records
-from dipn_jax.errors import UserError
 
 RESAMPLES = 2000
 
@@ -36,9 +34,10 @@ def ratio_interval(hits: np.ndarray, trials: np.ndarray, *, seed: int = 0) -> tu
 
 
 def write(out: pathlib.Path, values: dict[str, Any], *, settings: dict[str, Any]) -> None:
-    """Write `metrics.json` (flat keys) and `settings.json` (what was asked for, versions) to `out`."""
+    """Write `metrics.json` (flat keys; null where there was nothing to count) and `settings.json` to `out`."""
+    finite = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in values.items()}
     records.write_json(out / "settings.json", {**settings, "versions": records.package_versions()})
-    records.write_json(out / "metrics.json", values)
+    records.write_json(out / "metrics.json", finite)
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:
@@ -47,7 +46,4 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     Raises:
       UserError: there are none.
     """
-    try:
-        return json.loads((folder / "metrics.json").read_text())
-    except (OSError, json.JSONDecodeError):
-        raise UserError(f"{folder}: no readable metrics.json; give the --out of a dipn-eval command") from None
+    return records.read_json(folder / "metrics.json")

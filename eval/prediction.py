@@ -27,7 +27,7 @@ from dipn_jax import (
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Predictor
 from dipn_jax.scenes import SceneConfig
-from dipn_jax.structs import Observation, Push, Scene
+from dipn_jax.structs import Fault, Observation, Push, Scene, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
 from eval import resume
 
@@ -76,12 +76,7 @@ def evaluate(
             drop, aim = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch))
             items = clutter.settled_exactly(drop, engine, config, min(clutter.BATCH, scenes - done))
             pushes, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)
-            keep = np.asarray(feasible)
-            items, pushes = records.take(items, keep), records.take(pushes, keep)
-            truth = np.asarray(primitives.push(engine, items.scene, items.poses, pushes).poses)
-            rolled = None
-            if physics:
-                rolled = np.asarray(primitives.push(engine, _nominal(items.scene), items.poses, pushes).poses)
+            items, pushes, truth, rolled = _execute(engine, items, pushes, np.asarray(feasible), physics)
             for i in range(len(pushes.angle)):
                 scene, push = records.take(items.scene, i), records.take(pushes, i)
                 for centimetres in DISTANCES:
@@ -99,6 +94,21 @@ def evaluate(
             partial.save((done, batch, rows, films))
     names = [*measure, *(["physics"] if physics else [])]
     return _summary(rows, names), {k: np.stack([film[k] for film in films]) for k in films[0]}
+
+
+def _execute(
+    engine: Engine, items: SettledScene, pushes: Push, feasible: np.ndarray, physics: bool
+) -> tuple[SettledScene, Push, np.ndarray, np.ndarray | None]:
+    """The feasible pushes whose simulation went well, what they did `[B, 12, N, 7]`, and what nominal ones did."""
+    items, pushes = records.take(items, feasible), records.take(pushes, feasible)
+    if not feasible.any():
+        return items, pushes, np.zeros((0,)), None
+    result = primitives.push(engine, items.scene, items.poses, pushes)
+    good = (np.asarray(result.fault) & Fault.UNUSABLE) == 0
+    rolled = None
+    if physics:
+        rolled = np.asarray(primitives.push(engine, _nominal(items.scene), items.poses, pushes).poses)[good]
+    return records.take(items, good), records.take(pushes, good), np.asarray(result.poses)[good], rolled
 
 
 @jax.jit
@@ -174,9 +184,10 @@ def _summary(rows: dict[str, list[np.ndarray]], names: list[str]) -> dict[str, f
                 metrics[f"{title}/{at}/all"] = float(values[visible].mean())
                 metrics[f"{title}/{at}/moved"] = float(values[moved].mean()) if moved.any() else float("nan")
             for key in ("position_mm", "angle_deg"):
-                metrics[f"push_{key}/{at}/moved"] = float(np.concatenate(rows[f"{at}/{key}"])[moved].mean())
+                values = np.concatenate(rows[f"{at}/{key}"])[moved]
+                metrics[f"push_{key}/{at}/moved"] = float(values.mean()) if moved.any() else float("nan")
+            metrics[f"objects_moved/{centimetres}cm"] = int(moved.sum())
     metrics["objects"] = int(visible.sum())
-    metrics["objects_moved"] = int(moved.sum())
     metrics["pushes"] = len(rows[f"{names[0]}/{DISTANCES[0]}cm/visible"])
     return metrics
 

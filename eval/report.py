@@ -35,7 +35,7 @@ def write(
     random: pathlib.Path | None,
     runs: list[pathlib.Path],
 ) -> dict[str, Any]:
-    """Write `report.html`, its pictures and `metrics.json` to `out` and return the merged metrics.
+    """Read everything, then write `report.html`, its pictures and `metrics.json` to `out` and return the merged metrics.
 
     Args:
       out: folder.
@@ -50,26 +50,37 @@ def write(
     """
     values: dict[str, Any] = {}
     parts: list[str] = []
-    pictures = out / "pictures"
-    if hard or random:
-        clears = {name: folder for name, folder in (("hard", hard), ("random", random)) if folder}
+    figures: dict[str, Any] = {}
+    clears = {name: folder for name, folder in (("hard", hard), ("random", random)) if folder}
+    try:
         for name, folder in clears.items():
             values |= {f"clear/{name}/{key}": value for key, value in metrics.read(folder).items()}
-        parts.append(_clear_section(clears, values, pictures))
-    if prediction:
-        values |= metrics.read(prediction)
-        parts.append(_prediction_section(prediction, values, pictures))
-    if grasp:
-        values |= metrics.read(grasp)
-        parts.append(_grasp_section(values))
-    if runs:
-        parts.append(f"<h2>Learning curves</h2>{_image(_curves(runs), pictures / 'curves.png')}")
+        if clears:
+            figures |= {f"clear-{name}": _filmstrip(folder) for name, folder in clears.items()}
+            parts.append(_clear_section(clears, values))
+        if prediction:
+            values |= metrics.read(prediction)
+            figures["prediction"] = _prediction_film(_load(prediction / "films.npz"))
+            parts.append(_prediction_section(values))
+        if grasp:
+            values |= metrics.read(grasp)
+            parts.append(_grasp_section(values))
+        if runs:
+            figures["curves"] = _curves(runs)
+            parts.append("<h2>Learning curves</h2>{curves}")
+    except (KeyError, TypeError) as error:
+        raise UserError(
+            f"report: a folder lacks {error}; give the --out of the dipn-eval command it is named after"
+        ) from None
     if not parts:
         raise UserError("report: nothing to report; give --prediction, --grasp, --hard, --random or --runs")
+    body = "".join(parts)
+    for name, figure in figures.items():
+        body = body.replace(f"{{{name}}}", _image(figure, out / "pictures" / f"{name}.png"))
     versions = ", ".join(f"{k} {v}" for k, v in records.package_versions().items())
     page = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>dipn-jax report</title><style>{_STYLE}</style>'
-        f'<h1>Push or grasp?</h1>{"".join(parts)}<p class="note">Made with {html.escape(versions)}.</p></html>\n'
+        f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {html.escape(versions)}.</p></html>\n'
     )
     records.write_atomically(out / "report.html", page.encode())
     records.write_json(out / "metrics.json", values)
@@ -83,6 +94,10 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
     return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"
 
 
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
 def _percent(values: dict[str, Any], key: str) -> str:
     value = values.get(key)
     if value is None or not np.isfinite(value):
@@ -92,7 +107,7 @@ def _percent(values: dict[str, Any], key: str) -> str:
     return f"{100 * value:.1f}{interval}"
 
 
-def _clear_section(clears: dict[str, pathlib.Path], values: dict[str, Any], pictures: pathlib.Path) -> str:
+def _clear_section(clears: dict[str, pathlib.Path], values: dict[str, Any]) -> str:
     columns = ["completion", "grasp_success_completed", "grasp_success_all", "efficiency_completed", "efficiency_all"]
     rows = []
     for name in clears:
@@ -100,39 +115,32 @@ def _clear_section(clears: dict[str, pathlib.Path], values: dict[str, Any], pict
         counts = [str(values[f"{at}/{key}"]) for key in ("instances", "grasps", "pushes")]
         rows.append([name, *counts, *[_percent(values, f"{at}/{key}") for key in columns]])
     head = ["", "tables", "grasps", "pushes", *[f"{c.replace('_', ' ')} %" for c in columns]]
-    films = "".join(
-        f"<h3>{html.escape(name)}</h3>{_image(_filmstrip(folder), pictures / f'clear-{name}.png')}"
-        for name, folder in clears.items()
-    )
+    films = "".join(f"<h3>{name}</h3>{{clear-{name}}}" for name in clears)
     return (
         f"<h2>Clearing tables</h2>{_table(head, rows)}<p>With bootstrap 95 % intervals over tables.</p>"
         "<h2>What was seen, chosen, imagined, and what happened</h2>"
-        "<p>Pushes first: the scene with the chosen action, the image that the network predicted, the scene after.</p>"
+        "<p>Pushes first: the scene with the chosen action; the image predicted for the best push, with the values "
+        "compared (gamma times the mean grasp score on it, and the mean score now); the scene after.</p>"
         f"{films}"
     )
 
 
-def _prediction_section(folder: pathlib.Path, values: dict[str, Any], pictures: pathlib.Path) -> str:
+def _prediction_section(values: dict[str, Any]) -> str:
     rows = []
     for name in ("dipn", "static", "trans", "physics"):
         if f"push_error/{name}/5cm/all" not in values:
             continue
         cells = [
-            f"{values[f'{measure}/{name}/{distance}/{which}']:.3f}"
+            _figure(values.get(f"{measure}/{name}/{distance}/{which}"))
             for measure in ("push_error", "push_error_paper_measure")
             for distance in ("5cm", "10cm")
             for which in ("all", "moved")
         ]
         rows.append([name, *cells])
     head = ["", *[f"{m} {d} {w}" for m in ("1-IoU", "XOR/2") for d in ("5 cm", "10 cm") for w in ("all", "moved")]]
-    try:
-        films = np.load(folder / "films.npz")
-        picture = _image(_prediction_film(films), pictures / "prediction.png")
-    except (OSError, ValueError):
-        raise UserError(f"{folder}: no readable films.npz; run dipn-eval prediction again") from None
     return (
         f"<h2>Predicting a push</h2><p>{values['pushes']} held-out pushes, {values['objects']} objects in sight, "
-        f"{values['objects_moved']} moved.</p>{_table(head, rows)}{picture}"
+        f"{values['objects_moved/5cm']} moved after 5 cm.</p>{_table(head, rows)}{{prediction}}"
     )
 
 
@@ -151,6 +159,13 @@ def _image(figure: Any, path: pathlib.Path) -> str:
     plt.close(figure)
     records.write_atomically(path, stream.getvalue())
     return f'<img alt="{path.stem}" src="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}">'
+
+
+def _load(path: pathlib.Path) -> Any:
+    try:
+        return np.load(path)
+    except (OSError, ValueError):
+        raise UserError(f"{path}: missing or damaged; run the dipn-eval command that writes it again") from None
 
 
 def _show(axis: Any, picture: np.ndarray, title: str = "") -> None:
@@ -189,14 +204,10 @@ def _prediction_film(films: Any) -> Any:
 
 def _filmstrip(folder: pathlib.Path) -> Any:
     """Some steps of the tables of a `dipn-eval clear`: pushes first."""
-    try:
-        listed = json.loads((folder / "episodes.json").read_text())
-        steps = []
-        for entry in listed:
-            film = np.load(folder / entry["file"])
-            steps += [(entry, i, {key: film[key][i] for key in film.files}) for i in range(len(film["what"]))]
-    except (OSError, ValueError, KeyError):
-        raise UserError(f"{folder}: no readable episodes.json; run dipn-eval clear again") from None
+    steps = []
+    for entry in records.read_json(folder / "episodes.json", wanted=list):
+        film = _load(folder / entry["file"])
+        steps += [(entry, i, {key: film[key][i] for key in film.files}) for i in range(len(film["what"]))]
     steps.sort(key=lambda s: (str(s[2]["what"]) != "push", s[1]))
     chosen = steps[:FILM_ROWS]
     figure, axes = plt.subplots(len(chosen), 3, figsize=(7.5, 2.7 * len(chosen)), squeeze=False)
@@ -205,8 +216,12 @@ def _filmstrip(folder: pathlib.Path) -> Any:
         score, now, push = step["values"]
         _show(axes[row, 0], step["before"], f"{entry['name']}, action {i + 1}: {step['what']}")
         _arrow(axes[row, 0], step["push"]) if pushed else _jaws(axes[row, 0], step["grasp"])
-        title = f"predicted: {push:.4f} > {now:.4f}" if pushed else f"best grasp score {score:.2f}"
-        _show(axes[row, 1], step["predicted"], title)
+        if pushed:
+            _show(axes[row, 1], step["predicted"], f"predicted: {push:.4f} > {now:.4f}")
+        elif np.isfinite(push):
+            _show(axes[row, 1], step["predicted"], f"best push, not taken: {push:.4f} < {now:.4f}")
+        else:
+            _show(axes[row, 1], step["predicted"], f"no push considered: grasp score {score:.2f}")
         _show(axes[row, 2], step["after"], "what happened")
     return figure
 

@@ -5,29 +5,33 @@ from __future__ import annotations
 import json
 import pathlib
 import pickle
+from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import records
+from dipn_jax import checkpoint, records
 
 
 class Partial:
     """The state of an evaluation under way, in `OUT/partial.pickle`; that of other settings is not taken up."""
 
-    def __init__(self, out: pathlib.Path, settings: dict[str, Any]) -> None:
+    def __init__(self, out: pathlib.Path, settings: dict[str, Any], *, inputs: Sequence[pathlib.Path] = ()) -> None:
         """Look for a state.
 
         Args:
           out: folder of the evaluation.
-          settings: everything the results depend on.
+          settings: options that the results depend on.
+          inputs: files and runs that they depend on; their content counts, not their name.
         """
         self.path = out / "partial.pickle"
-        self.identity = json.dumps({k: str(v) for k, v in settings.items()} | records.package_versions())
+        content = [_fingerprint(path) for path in inputs]
+        named = {k: str(v) for k, v in settings.items()}
+        self.identity = json.dumps([named, content, records.package_versions()])
 
     def load(self, fresh: Any) -> Any:
         """The state kept, or `fresh` where there is none for these settings."""
         try:
             identity, state = pickle.loads(self.path.read_bytes())
-        except (OSError, pickle.UnpicklingError, EOFError, ValueError, TypeError):
+        except Exception:  # a foreign or damaged pickle can raise anything; then there is no state
             return fresh
         return state if identity == self.identity else fresh
 
@@ -38,3 +42,11 @@ class Partial:
     def finish(self) -> None:
         """The results are written: drop the state."""
         self.path.unlink(missing_ok=True)
+
+
+def _fingerprint(path: pathlib.Path) -> str:
+    """Of a file, or of the newest checkpoint of a run."""
+    if path.is_file():
+        return records.file_sha256(path)
+    found = checkpoint.newest(path)
+    return records.file_sha256(found[0] / "meta.json") if found else "none"

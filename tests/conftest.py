@@ -1,4 +1,4 @@
-"""Shared by all tests: strict JAX, compiled functions and small data made once a session."""
+"""Shared by all tests: compiled functions and small data made once a session."""
 
 from __future__ import annotations
 

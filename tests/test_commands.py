@@ -4,9 +4,11 @@ import pathlib
 import shutil
 
 import pytest
+from flax import nnx
 
 from datagen import cli as datagen_cli
-from dipn_jax import console, records
+from dipn_jax import checkpoint, console, records
+from dipn_jax.networks.grasp import GraspConfig
 from eval import cli as eval_cli
 from train import cli as train_cli
 
@@ -54,7 +56,7 @@ def test_a_negative_count(call, tmp_path: pathlib.Path) -> None:
 def test_a_missing_folder(call, tmp_path: pathlib.Path) -> None:
     nowhere = tmp_path / "nowhere"
     _one_line(call("datagen", "info", nowhere), "no manifest.json")
-    _one_line(call("datagen", "repair", nowhere), "no such folder")
+    _one_line(call("datagen", "repair", nowhere), "no such data set")
     _one_line(call("train", "push", "--data", nowhere, "--out", tmp_path / "r"), "no manifest.json")
     _one_line(call("eval", "prediction", "--push-net", nowhere, "--out", tmp_path / "e"), "no such folder")
     _one_line(call("eval", "clear", "--grasp-net", nowhere, "--out", tmp_path / "e"), "--push-net")
@@ -78,6 +80,34 @@ def test_an_unknown_shape_in_a_case_file(call, tmp_path: pathlib.Path) -> None:
         call("eval", "clear", "--grasp-net", tmp_path, "--method", "gn", "--cases", path, "--out", tmp_path / "e"),
         "sphere",
     )
+
+
+def test_a_checkpoint_of_another_architecture(call, tmp_path: pathlib.Path) -> None:
+    config = GraspConfig(width=8)
+    model = checkpoint.build("grasp", config)
+    checkpoint.save(tmp_path / "r", 1, {"model": nnx.state(model)}, network="grasp", config=config, extra={})
+    path = tmp_path / "r" / "checkpoints" / "00000001" / "meta.json"
+    path.write_text(path.read_text().replace('"width": 8', '"width": 16'))
+    _one_line(call("eval", "grasp", "--grasp-net", tmp_path / "r", "--out", tmp_path / "e"), "another architecture")
+    _one_line(call("eval", "prediction", "--push-net", tmp_path / "r", "--out", tmp_path / "e"), "want dipn")
+    assert not (tmp_path / "e").exists()
+
+
+def test_numbers_out_of_range(call, tmp_path: pathlib.Path) -> None:
+    clear = ("eval", "clear", "--grasp-net", tmp_path, "--out", tmp_path / "e")
+    for option, value in (("--distance", "5"), ("--gamma", "nan"), ("--candidates", "0"), ("--seed", "-1")):
+        _one_line(call(*clear, option, value), option)
+    _one_line(call("datagen", "push", "--out", tmp_path / "d", "--actions", "100000"), "--actions")
+    _one_line(call("datagen", "push", "--out", tmp_path / "d", "--objects", "0"), "--objects")
+    _one_line(call("datagen", "push", "--out", tmp_path / "d", "--timestep", "0.003"), "timestep")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_out_that_is_a_file(call, tmp_path: pathlib.Path) -> None:
+    (tmp_path / "file").touch()
+    _one_line(call("datagen", "push", "--out", tmp_path / "file"), "is not a folder")
+    _one_line(call("eval", "grasp", "--grasp-net", tmp_path, "--out", tmp_path / "file" / "x"), "is not a folder")
+    _one_line(call("datagen", "info", tmp_path / "file"), "no manifest.json")
 
 
 def test_an_option_that_does_not_exist_exits_with_2(call) -> None:

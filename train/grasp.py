@@ -15,11 +15,12 @@ from dipn_jax import geometry, losses, records, render
 from dipn_jax.networks import grasp
 from dipn_jax.structs import Grasp, GraspEpisode, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
+from train.split import split
 
 PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
-WINDOW = 112
-"""Pixels around an executed grasp; the compact network sees about 50 on each side."""
+WINDOWS = {"compact": 112, "paper": 320}
+"""Pixels around an executed grasp: the compact network sees about 50 on each side, the published one everything."""
 TABLE_WEIGHT = 0.05
 """Weight of a table pixel beside a foreground pixel: most of an image is table."""
 
@@ -28,13 +29,6 @@ def turned_view(scene: Scene, poses: jax.Array, center: jax.Array, angle: jax.Ar
     """The observation of a view centred on `center [2]` (metres) with its columns along `angle []`."""
     shift = -geometry.rotate2d(center, -angle)
     return render.render(scene, geometry.transform_poses(poses, -angle, shift), pixels=pixels)
-
-
-def _held_out(episodes: Any) -> tuple[Any, Any]:
-    """Training examples, and the last tenth."""
-    count = len(episodes.fault)
-    test = max(1, count // 10)
-    return records.take(episodes, slice(0, count - test)), records.take(episodes, slice(count - test, count))
 
 
 def _flips(key: jax.Array, images: jax.Array, *others: jax.Array) -> list[jax.Array]:
@@ -54,7 +48,7 @@ class PretrainTask:
 
     def __init__(self, data: pathlib.Path, config: grasp.GraspConfig) -> None:
         scenes, self.fingerprint = records.load(data, kind="images")
-        self.train_set, self.test_set = _held_out(scenes)
+        self.train_set, self.test_set = split(scenes, data)
         self.size = len(self.train_set.fault)
         self.network_config = config
 
@@ -82,7 +76,7 @@ class PretrainTask:
         return losses.score_loss(model(images), labels, weight)
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
-        """See `loop.Task`: loss and average precision at recall 0.5 on foreground pixels."""
+        """See `loop.Task`: loss on views of held-out scenes."""
         graph, state = nnx.split(model)
         index = np.arange(min(16, len(self.test_set.fault)))
         loss = self._measure(graph, state, records.take(self.test_set, index))
@@ -101,7 +95,8 @@ class GraspTask:
 
     def __init__(self, data: pathlib.Path, config: grasp.GraspConfig) -> None:
         episodes, self.fingerprint = records.load(data, kind="grasp")
-        self.train_set, self.test_set = _held_out(episodes)
+        self.train_set, self.test_set = split(episodes, data)
+        self.window = WINDOWS[config.preset]
         self.size = len(self.train_set.fault)
         self.network_config = config
 
@@ -120,10 +115,10 @@ class GraspTask:
         def one(scene: Scene, poses: jax.Array, taken: Grasp, shift: jax.Array) -> jax.Array:
             offset = (shift[::-1] + 0.5) * WORKSPACE.pixel  # (row, col) -> (x, y)
             center = taken.center - geometry.rotate2d(offset, taken.angle)
-            return render.rgbd(turned_view(scene, poses, center, taken.angle, pixels=WINDOW))
+            return render.rgbd(turned_view(scene, poses, center, taken.angle, pixels=self.window))
 
         images = jax.vmap(one)(episodes.scene, episodes.poses, episodes.grasp, phase)
-        return images, WINDOW // 2 + phase
+        return images, self.window // 2 + phase
 
     def _logits(self, model: nnx.Module, images: jax.Array, pixel: jax.Array) -> jax.Array:
         logits = model(images)

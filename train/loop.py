@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
 import json
 import logging
 import pathlib
@@ -107,11 +108,20 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
     Raises:
       UserError: the folder holds a run of another config or on other data.
     """
-    console.require_positive(steps=config.steps, batch=config.batch, learning_rate=config.learning_rate)
-    identity = _claim(task, config, out)
-    model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
-    graph, params, rest = _split(model)
+    console.require_positive(
+        steps=config.steps,
+        batch=config.batch,
+        learning_rate=config.learning_rate,
+        eval_every=config.eval_every,
+        save_every=config.save_every,
+    )
+    console.require_between(0, 1, weight_decay=config.weight_decay)
+    console.require_seed(config.seed)
+    console.require_out(out)
     optimizer = _optimizer(config)
+    model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
+    records.claim(out, _identity(task, config, initial))
+    graph, params, rest = _split(model)
     moments, begin = optimizer.init(params), 0
     found = checkpoint.newest(out)
     if found:
@@ -129,52 +139,54 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
     def save(step: int) -> None:
         parts = {"model": nnx.state(nnx.merge(graph, params, rest)), "train": moments}
         checkpoint.save(
-            out, step, parts, network=task.network, config=task.network_config, extra={"run": identity, **latest}
+            out,
+            step,
+            parts,
+            network=task.network,
+            config=task.network_config,
+            extra={"seed": config.seed, "data": task.fingerprint, **latest},
         )
 
     step = begin
-    with console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin) as progress:
-        try:
-            while step < config.steps:
-                batch = task.fetch(np.asarray(order[step]))
-                params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
-                step += 1
-                if step % config.eval_every == 0 or step == config.steps:
-                    model = nnx.merge(graph, params, rest)
-                    model.eval()
-                    latest = {"loss": float(loss), **task.evaluate(model)}
-                    log.write(step, latest)
-                if step % config.save_every == 0 or step == config.steps:
-                    save(step)
-                progress.advance(1, " ".join(f"{k} {v:.3f}" for k, v in latest.items()))
-        except KeyboardInterrupt:
-            jax.block_until_ready(params)
-            save(step)
-            raise
+    progress = console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin)
+    with progress, console.Interruption() as interruption:
+        while step < config.steps:
+            batch = task.fetch(np.asarray(order[step]))
+            params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
+            step += 1
+            if step % config.eval_every == 0 or step == config.steps:
+                model = nnx.merge(graph, params, rest)
+                model.eval()
+                latest = {"loss": float(loss), **task.evaluate(model)}
+                log.write(step, latest)
+            if step % config.save_every == 0 or step == config.steps or interruption.requested:
+                save(step)
+            if interruption.requested:
+                raise KeyboardInterrupt
+            progress.advance(1, " ".join(f"{k} {v:.3f}" for k, v in latest.items()))
     log.close()
     return latest or log.last()
 
 
-def _claim(task: Task, config: TrainConfig, out: pathlib.Path) -> dict[str, Any]:
-    """Write the run's config, or check that it is the one that the folder was begun with."""
-    identity = {
-        "network": task.network,
-        "network_config": dataclasses.asdict(task.network_config),
-        "train": dataclasses.asdict(config),
-        "data": task.fingerprint,
-    }
-    identity = json.loads(json.dumps(identity))
-    path = out / "config.json"
-    if path.exists():
-        theirs = json.loads(path.read_text())
-        different = [k for k in identity if theirs.get(k) != identity[k]]
-        if different:
-            raise UserError(
-                f"{out}: holds a run with another {different[0]} ({theirs.get(different[0])}); "
-                "give another --out, or the same options and data to go on"
-            )
-    records.write_json(path, identity)
-    return identity
+def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> dict[str, Any]:
+    """What a run is a function of; flat, so that a difference can be named."""
+    start = None
+    if initial is not None:
+        digest = hashlib.sha256()
+        for leaf in jax.tree.leaves(nnx.state(initial, nnx.Param)):
+            digest.update(np.asarray(leaf).tobytes())
+        start = digest.hexdigest()
+    network = {f"network.{k}": v for k, v in dataclasses.asdict(task.network_config).items()}
+    data = {"network": task.network, "initial_weights": start, "data": task.fingerprint}
+    return {**data, **network, **dataclasses.asdict(config)}
+
+
+def _step_of(line: str) -> float:
+    """The step of a line of `metrics.jsonl`; infinite if a hard stop cut the line."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError):
+        return float("inf")
 
 
 class _Log:
@@ -183,7 +195,7 @@ class _Log:
     def __init__(self, out: pathlib.Path, begin: int) -> None:
         self.path = out / "metrics.jsonl"
         old = self.path.read_text().splitlines() if self.path.exists() else []
-        kept = [line for line in old if json.loads(line)["step"] <= begin]
+        kept = [line for line in old if _step_of(line) <= begin]
         records.write_atomically(self.path, "".join(line + "\n" for line in kept).encode())
         self.events = tensorboardX.SummaryWriter(str(out / "events"), purge_step=begin)
 

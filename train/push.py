@@ -16,6 +16,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn
 from dipn_jax.structs import PushEpisode
 from dipn_jax.workspace import PUSH_STEPS
+from train.split import split
 
 
 class PushTask:
@@ -38,16 +39,12 @@ class PushTask:
             raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
         episodes, fingerprint = records.load(data, kind="push")
         count = len(episodes.fault)
-        if limit is not None and limit > count:
-            raise UserError(f"--limit {limit}: {data} has {count} episodes; generate more or ask for fewer")
-        count = limit or count
-        held_out = max(1, count // 10)
-        if count - held_out < 1:
-            raise UserError(f"data set {data}: {count} episodes; want at least 2")
-        self.train_set = records.take(episodes, slice(0, count - held_out))
-        self.test_set = records.take(episodes, slice(count - held_out, count))
+        if limit is not None and not 2 <= limit <= count:
+            raise UserError(f"--limit {limit}: want 2 to {count}, the number of episodes in {data}")
+        count = count if limit is None else limit
+        self.train_set, self.test_set = split(records.take(episodes, slice(0, count)), data)
         self.network_config = config
-        self.size = count - held_out
+        self.size = len(self.train_set.fault)
         self.fingerprint = f"{fingerprint}:{count}:{centimetres}"
         self.centimetres = np.array(centimetres, np.int32)
         self.slots = episodes.scene.shape.shape[1]

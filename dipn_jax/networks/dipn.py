@@ -168,9 +168,9 @@ class _PaperEncoders(nnx.Module):
         self.item_out = nnx.Linear(2048, 64, rngs=rngs)
         self.sizes = (512, 64)
 
-    def __call__(self, maps: jax.Array, crops: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, maps: jax.Array, crops: jax.Array, present: jax.Array) -> tuple[jax.Array, jax.Array]:
         scene = self.scene_out(self.scene(maps)[-1].mean((1, 2)))
-        item = self.item_out(self.item(crops[..., :1])[-1].mean((1, 2)))
+        item = self.item_out(self.item(crops[..., :1], present)[-1].mean((1, 2)))
         return scene, item
 
 
@@ -203,7 +203,8 @@ class _CompactEncoders(nnx.Module):
         self.item = _CompactEncoder(3, 3, config.width, CROP // config.stride, 128, rngs)
         self.sizes = (128, 128)
 
-    def __call__(self, maps: jax.Array, crops: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, maps: jax.Array, crops: jax.Array, present: jax.Array) -> tuple[jax.Array, jax.Array]:
+        del present  # no batch statistics
         return self.scene(maps), self.item(crops)
 
 
@@ -231,7 +232,7 @@ class DIPN(nnx.Module):
         b, n = inputs.present.shape
         maps = jnp.stack([inputs.push_map, inputs.scene_map], -1)
         crops = inputs.crops.reshape(b * n, *inputs.crops.shape[2:])
-        scene, item = self.encoders(maps, crops)
+        scene, item = self.encoders(maps, crops, inputs.present.reshape(-1))
         where = self.center(inputs.centers / (WORKSPACE.half / 2))
         e_item = jnp.concatenate([item.reshape(b, n, -1), where], -1)
         motion = self.interaction(self.push(inputs.push), e_item, scene, inputs.present)

@@ -17,6 +17,10 @@ VIEW = 320
 """Pixels of the padded, rotated input: the turned 224 pixel map fits."""
 
 
+MIN_DEPTH = 0.002
+"""Metres of object that must be between the fingers; objects 25 mm high lie 5 mm over the lowest fingertip."""
+
+
 @dataclasses.dataclass(frozen=True)
 class GraspConfig:
     """Architecture. `paper` is as published; `compact` scores 16 rotations in a fraction of a second on a CPU."""
@@ -121,13 +125,6 @@ def score_image(network: GraspNet, image: jax.Array) -> jax.Array:
     return jnp.tile(scores, (ROTATIONS // len(angles), 1, 1))
 
 
-def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The best of scores `[16, H, W]`: index `[3]` (rotation, row, col) and its score."""
-    flat = jnp.argmax(scores)
-    index = jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
-    return index, scores.reshape(-1)[flat]
-
-
 def geometric_labels(height: jax.Array) -> jax.Array:
     """Which grasps are free of physics' objections, from the height map of a turned view alone.
 
@@ -153,4 +150,4 @@ def geometric_labels(height: jax.Array) -> jax.Array:
         return top[:, begin : begin + height.shape[1]]
 
     fingers = jnp.maximum(highest(-28, -19, 4), highest(19, 28, 4))
-    return ((height > tip + 0.005) & (fingers < tip)).astype(jnp.float32)
+    return ((height > tip + MIN_DEPTH) & (fingers < tip)).astype(jnp.float32)

@@ -34,12 +34,12 @@ class Bottleneck(nnx.Module):
                 [conv(features_in, out, 1, rngs, stride=stride, bias=False), nnx.BatchNorm(out, rngs=rngs)]
             )
 
-    def __call__(self, x: jax.Array) -> jax.Array:
-        y = nnx.relu(self.norms[0](self.reduce(x)))
-        y = nnx.relu(self.norms[1](self.spatial(y)))
-        y = self.norms[2](self.expand(y))
-        for layer in self.project:
-            x = layer(x)
+    def __call__(self, x: jax.Array, mask: jax.Array | None = None) -> jax.Array:
+        y = nnx.relu(self.norms[0](self.reduce(x), mask=mask))
+        y = nnx.relu(self.norms[1](self.spatial(y), mask=mask))
+        y = self.norms[2](self.expand(y), mask=mask)
+        if self.project:
+            x = self.project[1](self.project[0](x), mask=mask)
         return nnx.relu(x + y)
 
 
@@ -47,7 +47,7 @@ class ResNet(nnx.Module):
     """Bottleneck ResNet; `stages=(3, 4, 6, 3)` is ResNet-50.
 
     Input `[B, H, W, C]`; returns the four stages' maps at strides 4, 8, 16, 32 with 256, 512, 1024 and
-    2048 channels.
+    2048 channels. `mask [B]` bool leaves images out of the batch statistics.
     """
 
     def __init__(self, features_in: int, stages: Sequence[int], rngs: nnx.Rngs) -> None:
@@ -63,13 +63,14 @@ class ResNet(nnx.Module):
             blocks.append(nnx.List(row))
         self.blocks = nnx.List(blocks)
 
-    def __call__(self, x: jax.Array) -> list[jax.Array]:
-        x = nnx.relu(self.stem_norm(self.stem(x)))
+    def __call__(self, x: jax.Array, mask: jax.Array | None = None) -> list[jax.Array]:
+        mask = None if mask is None else mask[:, None, None, None]
+        x = nnx.relu(self.stem_norm(self.stem(x), mask=mask))
         x = nnx.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
         maps = []
         for row in self.blocks:
             for block in row:
-                x = block(x)
+                x = block(x, mask)
             maps.append(x)
         return maps
 

@@ -84,6 +84,13 @@ def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
     generate(dataclasses.replace(JOB, episodes=32), copy)
     assert len(records.load(copy, kind="push")[0].fault) == 32
     assert json.loads((copy / "config.json").read_text())["episodes"] == 32
+    with pytest.raises(UserError, match="begun with 32 episodes, asked for 24"):
+        generate(JOB, copy)
+
+
+def test_a_shard_does_not_depend_on_how_many_others_there_are(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    generate(dataclasses.replace(JOB, episodes=16), tmp_path / "short")
+    assert records.shard_path(tmp_path / "short", 0).read_bytes() == records.shard_path(copy, 0).read_bytes()
 
 
 def test_nonsense_is_refused(tmp_path: pathlib.Path) -> None:
@@ -93,6 +100,11 @@ def test_nonsense_is_refused(tmp_path: pathlib.Path) -> None:
     for timestep in (-0.002, 0.004, 0.0):
         with pytest.raises(UserError, match="timestep"):
             generate(dataclasses.replace(JOB, timestep=timestep), tmp_path / "x")
+    with pytest.raises(UserError, match="--seed"):
+        generate(dataclasses.replace(JOB, seed=-1), tmp_path / "x")
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="is not a folder"):
+        generate(JOB, tmp_path / "file")
     with pytest.raises(UserError, match="--shard 2 --of 2"):
         generate(JOB, tmp_path / "x", part=2, of=2)
     assert not (tmp_path / "x").exists()

@@ -77,3 +77,9 @@ def test_random_grasps_lie_on_objects_at_the_height_below_them(settled: Any) -> 
     np.testing.assert_allclose(grasps.height, np.maximum(height - 0.04, 0.02), atol=1e-6)
     steps = np.asarray(grasps.angle) / (np.pi / 8)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-4)
+
+
+def test_best_grasp_is_the_highest() -> None:
+    scores = jnp.zeros((16, 224, 224)).at[5, 17, 200].set(0.9)
+    index, score = candidates.best_grasp(scores)
+    assert index.tolist() == [5, 17, 200] and np.isclose(score, 0.9)

@@ -54,6 +54,10 @@ def test_only_the_newest_steps_are_kept(tmp_path: pathlib.Path) -> None:
     for step in (1, 2, 3):
         _save(tmp_path, step)
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["00000002", "00000003"]
+    (tmp_path / "checkpoints" / "00000003" / "meta.json").write_text("[]")
+    _save(tmp_path, 4)
+    assert checkpoint.newest(tmp_path)[1]["step"] == 4  # type: ignore[index]
+    assert (tmp_path / "checkpoints" / "00000002").exists(), "the damaged step does not push out the good one"
 
 
 def test_what_cannot_be_used_is_named(tmp_path: pathlib.Path) -> None:

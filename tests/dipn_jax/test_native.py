@@ -118,7 +118,6 @@ def test_faults_are_data_of_their_own_episode(engine: Any, resting: Any) -> None
 def test_a_gripper_that_is_stopped_says_so(engine: Any, resting: Any) -> None:
     scene, poses = resting
     heavy = scene.replace(mass=np.full_like(scene.mass, 60.0))
-    rollout = primitives.push(engine, heavy, poses, _pushes(5))
     trajectory = primitives.push_trajectory(jax.tree.map(jnp.asarray, _pushes(5)))
     cut = np.array([1.5])  # at the end of travel, before the gripper lifts
     rollout = engine.simulate(heavy, poses, trajectory, cut)

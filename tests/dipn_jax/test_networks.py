@@ -153,12 +153,6 @@ def test_geometric_labels_of_a_bar() -> None:
     assert crowded[80, 80] == 0, "a finger would land on the neighbour"
 
 
-def test_best_grasp_is_the_highest() -> None:
-    scores = jnp.zeros((16, 224, 224)).at[5, 17, 200].set(0.9)
-    index, score = grasp.best_grasp(scores)
-    assert index.tolist() == [5, 17, 200] and np.isclose(score, 0.9)
-
-
 def test_the_angles_are_sixteen_even_ones() -> None:
     np.testing.assert_allclose(np.diff(grasp_angles()), np.pi / 8, atol=1e-6)
 
@@ -196,4 +190,4 @@ def test_paper_grasp_net_takes_a_training_step() -> None:
     assert nnx.jit(lambda m, x: m(x))(model, images).shape == (1, 320, 320)
     model.train()
     before, after = _one_step(model, lambda m: losses.score_loss(m(images), target, jnp.ones_like(target)))
-    assert np.isfinite(before) and np.isfinite(after)
+    assert np.isfinite(before) and after < before

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import planner, policy, records, render
+from dipn_jax import candidates, planner, policy, records, render
 from dipn_jax.structs import Observation, Push
 
 SLOTS, COUNT = 5, 8
@@ -23,11 +23,17 @@ def bare(images: jax.Array) -> jax.Array:
     return 1 - covered(images)
 
 
-def hide_everything(observation: Observation, pushes: Push) -> jax.Array:
-    """Everything leaves the map for the first candidate, and stays for the others."""
-    del observation
-    far = jnp.zeros((COUNT, SLOTS, 3))
-    return far.at[0, :, 2].set(1.0)
+def stack_for_the_third(observation: Observation, pushes: Push) -> jax.Array:
+    """With the third candidate every object ends in the middle, on top of one another: less is covered."""
+    centers, _ = candidates.mask_centers(observation.label, SLOTS)
+    still = jnp.zeros((COUNT, SLOTS, 3))
+    return still.at[2, :, :2].set(-centers)
+
+
+def bare_squared(images: jax.Array) -> jax.Array:
+    """High where nothing is, only if nearly nothing is anywhere: one stack scores far more than a full table."""
+    share = (images[..., 3] > 0).mean((1, 2))
+    return jnp.broadcast_to((1 - 20 * share)[:, None, None, None], (images.shape[0], 16, 224, 224))
 
 
 static = policy.static_predictor(SLOTS)
@@ -74,13 +80,13 @@ def test_a_push_that_clears_the_view_is_dropped_as_out_of_the_workspace(seen: Ob
     assert not decision.is_push and not decision.feasible.any()
 
 
-def test_the_rule_is_the_mean_over_all_grasps(seen: Observation) -> None:
-    decision = _decide(seen, hide_everything, bare, threshold=2.0)
-    image = np.asarray(decision.predicted)
-    want = 0.9 * np.asarray(bare(jnp.asarray(image)[None])).mean()
-    np.testing.assert_allclose(decision.value_push, want, rtol=1e-4)
-    np.testing.assert_allclose(decision.value_now, np.asarray(bare(render.rgbd(seen)[None])).mean(), rtol=1e-4)
-    assert decision.best == np.argmax(decision.values)
+def test_the_push_that_raises_the_mean_most_is_chosen(seen: Observation) -> None:
+    decision = _decide(seen, stack_for_the_third, bare_squared, threshold=2.0)
+    assert decision.feasible[2] and decision.best == 2 and decision.is_push
+    np.testing.assert_array_equal(decision.push.start, decision.pushes.start[2])
+    now, after = (np.asarray(bare_squared(image[None])).mean() for image in (render.rgbd(seen), decision.predicted))
+    np.testing.assert_allclose([decision.value_now, decision.value_push], [now, 0.9 * after], rtol=1e-4)
+    assert not _decide(seen, stack_for_the_third, bare_squared, threshold=2.0, gamma=0.1).is_push
 
 
 def test_trans_moves_only_the_pushed_object_by_the_push_length(seen: Observation) -> None:

@@ -56,7 +56,8 @@ def test_a_damaged_shard_is_named_and_repaired(copy: pathlib.Path, damage: str) 
     assert [p.name for p, _ in records.verify(copy)] == [path.name]
     with pytest.raises(UserError, match=r"shard-00001\.parquet"):
         records.load(copy, kind="push")
-    records.repair(copy)
+    set_aside = records.repair(copy)
+    assert len(set_aside) == (damage != "delete")
     assert records.verify(copy) == []
     assert len(records.load(copy, kind="push")[0].fault) == 16
 
@@ -75,6 +76,16 @@ def test_another_schema_version_is_named(copy: pathlib.Path, monkeypatch: pytest
     monkeypatch.setattr(records, "SCHEMA_VERSION", 99)
     with pytest.raises(UserError, match="schema version 1, want 99"):
         records.read_shard(records.shard_path(copy, 0), kind="push")
+    with pytest.raises(UserError, match="schema version 1, want 99"):
+        records.repair(copy)
+    assert records.shard_path(copy, 0).exists(), "what is only old is not set aside"
+
+
+def test_a_folder_that_is_no_data_set_is_left_alone(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "shard-1.parquet").write_text("somebody else's")
+    with pytest.raises(UserError, match="no such data set"):
+        records.repair(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["shard-1.parquet"]
 
 
 def test_the_fingerprint_follows_the_content(copy: pathlib.Path) -> None:
@@ -96,3 +107,4 @@ def test_a_write_that_dies_leaves_the_old_file(tmp_path: pathlib.Path, monkeypat
     with pytest.raises(KeyboardInterrupt):
         records.write_json(path, {"a": 2})
     assert json.loads(path.read_text()) == {"a": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["manifest.json"]

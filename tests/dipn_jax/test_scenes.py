@@ -66,6 +66,9 @@ def _file(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
         ({"position_m": [1, 0]}, "out of range"),
         ({"quaternion_wxyz": [0, 0, 0, 0]}, "out of range"),
         ({"position_m": "left"}, "position_m"),
+        ({"height_m": "x"}, "height_m|could not convert"),
+        ({"height_m": float("nan")}, "height_m"),
+        ({"color_rgb": [-9999, 0, 0]}, "color_rgb"),
     ],
 )
 def test_a_wrong_case_file_is_named(tmp_path: pathlib.Path, changes: dict[str, Any], says: str) -> None:
@@ -73,7 +76,10 @@ def test_a_wrong_case_file_is_named(tmp_path: pathlib.Path, changes: dict[str, A
         scenes.load_cases(_file(tmp_path, **changes))
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"cases": []}', '{"cases": [{"name": "x"}]}'])
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", '{"cases": []}', '{"cases": [{"name": "x"}]}', '{"cases": 3}', '{"cases": [1]}', '{"cases": {"a": 1}}'],
+)
 def test_a_file_that_is_no_case_file_is_named(tmp_path: pathlib.Path, text: str) -> None:
     path = tmp_path / "cases.json"
     path.write_text(text)

@@ -5,13 +5,16 @@ import json
 import pathlib
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint, policy, scenes
+from dipn_jax import checkpoint, policy, records, render, scenes
+from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.structs import Push
 from eval import clearing, grasping, metrics, prediction, report
 from eval.resume import Partial
 
@@ -48,7 +51,7 @@ def _ended(name: str, steps: list[str], removed: int, objects: int) -> clearing.
     instance = clearing.Instance("x", None, np.zeros((1, 7)), objects)  # type: ignore[arg-type]
     instance.ended, instance.removed = name, removed
     instance.film = [{"what": step} for step in steps]
-    instance.pushes = steps.count("push")
+    instance.pushes, instance.held = steps.count("push"), steps.count("grasp held")
     instance.grasps = len(steps) - instance.pushes
     return instance
 
@@ -62,7 +65,16 @@ def test_summary_counts_as_the_paper_does() -> None:
     assert values["completion"] == 0.5
     assert values["grasp_success_all"] == 3 / 4 and values["grasp_success_completed"] == 2 / 3
     assert values["efficiency_all"] == 3 / 6 and values["efficiency_completed"] == 2 / 4
-    assert values["pushes"] == 2 and values["ended_pushed_out"] == 1
+    assert values["grasps_that_held"] == 3 / 4 and values["pushes"] == 2 and values["ended_pushed_out"] == 1
+
+
+def test_a_case_that_does_not_come_to_rest_is_named(engine: Any, tmp_path: pathlib.Path) -> None:
+    box = {"shape": "cuboid", "size_mm": [50, 50, 50], "position_m": [0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
+    edge = box | {"position_m": [0.223, 0], "height_m": 0.3, "quaternion_wxyz": [0.9, 0.3, 0.3, 0]}
+    path = tmp_path / "cases.json"
+    path.write_text(json.dumps({"cases": [{"name": "a", "objects": [box]}, {"name": "b/..", "objects": [edge]}]}))
+    with pytest.raises(UserError, match=r"case b/\.\. of .* does not come to rest"):
+        clearing.hard_instances(engine, path, None, slots=1, repeats=1, seed=0)
 
 
 def test_prediction_measures_the_baselines_as_they_are(
@@ -77,6 +89,19 @@ def test_prediction_measures_the_baselines_as_they_are(
     assert values["push_error/static/5cm/all"] < values["push_error/static/10cm/all"]
     for key, value in values.items():
         assert np.isfinite(value), key
+
+
+def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> None:
+    scene, poses = records.take(settled.scene, 0), jnp.asarray(settled.poses[0])
+    after = poses.at[0, 0].add(0.01)
+    push = Push(jnp.zeros(2), jnp.float32(0.0), jnp.float32(0.05))
+    got = prediction._measurer(policy.static_predictor(5), 5)(scene, push, poses, after)
+    labels = [np.asarray(render.render_depth(scene, p)[1]) for p in (poses, after)]
+    for i in range(5):
+        a, b = labels[0] == i, labels[1] == i
+        want = 1 - (a & b).sum() / max((a | b).sum(), 1) if (a | b).any() else 0.0
+        np.testing.assert_allclose(got["one_minus_iou"][i], want, atol=1e-6)
+    assert got["moved"].tolist() == [bool((labels[0] == 0).any()), False, False, False, False]
 
 
 def test_grasp_evaluation_writes_what_it_promises(
@@ -120,6 +145,8 @@ def test_every_table_ends_by_the_rules(cleared: Any) -> None:
         assert table.ended in ("cleared", "pushed out", "out of actions")
         assert table.actions <= 3 * table.objects and table.actions == len(table.film)
         assert table.removed == table.objects - (table.scene.shape >= 0).sum()
+    kinds = {step["what"] for table in tables for step in table.film}
+    assert "push" in kinds and kinds & {"grasp held", "grasp missed"}
     listed = json.loads((out / "episodes.json").read_text())
     assert [entry["name"] for entry in listed] == ["06", "10"]
     film = np.load(out / listed[0]["file"])

@@ -1,0 +1,30 @@
+"""Which examples are held out for the learning curve."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from dipn_jax import records
+from dipn_jax.errors import UserError
+
+
+def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
+    """Training examples, and about the last tenth; no scene is on both sides.
+
+    Args:
+      episodes: a struct with `scene` and a leading `[B]`; the actions tried on one scene stand together.
+      data: where they came from, for the error.
+
+    Raises:
+      UserError: there are not two scenes.
+    """
+    size = np.asarray(episodes.scene.size)
+    begins = np.flatnonzero((size[1:] != size[:-1]).any((1, 2))) + 1  # first examples of the second, third, ... scene
+    if not len(begins):
+        raise UserError(f"data set {data}: {len(size)} examples of one scene; want at least two scenes")
+    wanted = len(size) - max(1, len(size) // 10)
+    cut = int(begins[np.argmin(np.abs(begins - wanted))])
+    return records.take(episodes, slice(0, cut)), records.take(episodes, slice(cut, len(size)))
