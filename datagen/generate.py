@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from datagen import episodes
-from dipn_jax import clutter, console, records
+from dipn_jax import clutter, console, files, records
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, EngineName, make_engine, resolve
 from dipn_jax.scenes import SceneConfig
@@ -109,7 +109,7 @@ def _written(out: pathlib.Path, index: int, job: Job) -> bool:
 
 def _claim(job: Job, out: pathlib.Path) -> None:
     """A folder holds one config; more episodes of it may be asked for later, not fewer."""
-    records.claim(out, job.describe() | {"episodes": max(job.episodes, _begun_with(out))}, free=("episodes",))
+    files.claim(out, job.describe() | {"episodes": max(job.episodes, _begun_with(out))}, free=("episodes",))
     if job.episodes < _begun_with(out):
         raise UserError(
             f"{out}: begun with {_begun_with(out)} episodes, asked for {job.episodes}; give another --out, or as many"
@@ -118,4 +118,4 @@ def _claim(job: Job, out: pathlib.Path) -> None:
 
 def _begun_with(out: pathlib.Path) -> int:
     path = out / "config.json"
-    return int(records.read_json(path).get("episodes", 0)) if path.exists() else 0
+    return int(files.read_json(path).get("episodes", 0)) if path.exists() else 0

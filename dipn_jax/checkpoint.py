@@ -19,7 +19,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import records
+from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp
 
@@ -68,17 +68,17 @@ def save(
     for name, tree in parts.items():
         checkpointer.save(temporary / name, _flat(tree))
     checkpointer.wait_until_finished()
-    files = sorted(p for p in temporary.rglob("*") if p.is_file())
+    stored = sorted(p for p in temporary.rglob("*") if p.is_file())
     meta = {
         "format_version": FORMAT_VERSION,
         "network": network,
         "network_config": dataclasses.asdict(config),
         "step": step,
-        "versions": records.package_versions(),
-        "sha256": {str(p.relative_to(temporary)): records.file_sha256(p) for p in files},
+        "versions": files.package_versions(),
+        "sha256": {str(p.relative_to(temporary)): files.file_sha256(p) for p in stored},
         **extra,
     }
-    records.write_json(temporary / "meta.json", meta)
+    files.write_json(temporary / "meta.json", meta)
     shutil.rmtree(final, ignore_errors=True)
     temporary.rename(final)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
@@ -90,7 +90,7 @@ def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
     """The meta data of a step folder, or None if anything in it is missing or changed."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
-        good = all(records.file_sha256(folder / name) == digest for name, digest in meta["sha256"].items())
+        good = all(files.file_sha256(folder / name) == digest for name, digest in meta["sha256"].items())
         good = good and meta["format_version"] == FORMAT_VERSION and meta["network"] in NETWORKS
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None

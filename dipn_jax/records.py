@@ -11,9 +11,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import hashlib
-import importlib.metadata
 import json
-import os
 import pathlib
 from typing import Any
 
@@ -22,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dipn_jax import structs
+from dipn_jax import files, structs
 from dipn_jax.errors import UserError
 
 
@@ -40,90 +38,9 @@ MANIFEST = "manifest.json"
 _META = b"dipn_jax"
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of the packages that results depend on."""
-    names = ("dipn-jax", "jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
-    found = {}
-    for name in names:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "unknown"
-    return found
-
-
 def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
     """Where shard `index` of a data set lies."""
     return folder / f"shard-{index:05d}.parquet"
-
-
-def file_sha256(path: pathlib.Path) -> str:
-    """SHA-256 of a file's bytes, in hex."""
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
-
-
-def write_atomically(path: pathlib.Path, data: bytes) -> None:
-    """Write under a temporary name, sync, rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.rename(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_json(path: pathlib.Path, value: Any) -> None:
-    """Write JSON atomically, keys in the given order."""
-    write_atomically(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
-
-
-def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
-    """A JSON file.
-
-    Raises:
-      UserError: it is missing, is not JSON, or is not a `wanted` at its top.
-    """
-    try:
-        value = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
-    except (OSError, ValueError):
-        raise UserError(f"{path}: damaged, not JSON; delete it or give another folder") from None
-    if not isinstance(value, wanted):
-        raise UserError(f"{path}: holds a {type(value).__name__}, want a {wanted.__name__}; give another folder")
-    return value
-
-
-def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = ()) -> None:
-    """Write `out/config.json`, or check that the folder was begun with the same one.
-
-    Args:
-      out: folder of a data set or a run.
-      identity: JSON-able, flat: everything the content depends on.
-      free: keys that may change.
-
-    Raises:
-      UserError: the folder was begun with something else.
-    """
-    path, mine = out / "config.json", json.loads(json.dumps(identity))
-    if path.exists():
-        theirs = read_json(path)
-        different = [key for key in mine if key not in free and theirs.get(key) != mine[key]]
-        if different:
-            key = different[0]
-            raise UserError(
-                f"{out}: begun with {key}={theirs.get(key)}, asked for {key}={mine[key]}; give another --out, or the "
-                "same options and data to go on"
-            )
-    write_json(path, mine)
 
 
 def _columns(episodes: Any) -> dict[str, np.ndarray]:
@@ -157,13 +74,13 @@ def write_shard(
         "columns": specs,
         "config": config,
         "faults": faults,
-        "versions": package_versions(),
+        "versions": files.package_versions(),
     }
     table = pa.Table.from_arrays(arrays, names=list(columns))
     table = table.replace_schema_metadata({_META: json.dumps(meta).encode()})
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
-    write_atomically(shard_path(folder, index), sink.getvalue().to_pybytes())
+    files.write_atomically(shard_path(folder, index), sink.getvalue().to_pybytes())
 
 
 def read_meta(path: pathlib.Path) -> dict[str, Any]:
@@ -245,7 +162,7 @@ def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
             entry = {
                 "episodes": count(path),
                 "bytes": path.stat().st_size,
-                "sha256": file_sha256(path),
+                "sha256": files.file_sha256(path),
                 "kind": meta["kind"],
                 "faults": meta["faults"],
             }
@@ -256,7 +173,7 @@ def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
         "episodes": sum(entry["episodes"] for entry in shards.values()),
         "shards": shards,
     }
-    write_json(folder / MANIFEST, manifest)
+    files.write_json(folder / MANIFEST, manifest)
     return manifest
 
 
@@ -281,7 +198,7 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
             problems.append((path, "missing"))
         elif path.stat().st_size != entry["bytes"]:
             problems.append((path, f"{path.stat().st_size} bytes, want {entry['bytes']}"))
-        elif file_sha256(path) != entry["sha256"]:
+        elif files.file_sha256(path) != entry["sha256"]:
             problems.append((path, "SHA-256 differs from the manifest's"))
     listed = set(manifest["shards"])
     problems += [(p, "not in the manifest") for p in sorted(folder.glob("shard-*.parquet")) if p.name not in listed]
@@ -304,7 +221,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     for path in sorted(folder.glob("shard-*.parquet")):
         try:
             read_shard(path, kind=read_meta(path)["kind"])
-            good = path.name not in known or file_sha256(path) == known[path.name]["sha256"]
+            good = path.name not in known or files.file_sha256(path) == known[path.name]["sha256"]
         except DamagedShard:
             good = False
         if not good:

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import candidates, clutter, console, planner, policy, primitives, records, render, scenes
+from dipn_jax import candidates, clutter, console, files, planner, policy, primitives, records, render, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Decision, Fault, Observation, Push, Rollout, Scene
@@ -292,7 +292,7 @@ def save(instances: list[Instance], out: pathlib.Path) -> None:
                 "pushes": instance.pushes,
             }
         )
-    records.write_json(out / "episodes.json", lines)
+    files.write_json(out / "episodes.json", lines)
 
 
 def load_policies(config: ClearConfig, push_net: pathlib.Path | None, grasp_net: pathlib.Path, slots: int) -> Any:

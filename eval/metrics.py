@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import records
+from dipn_jax import files
 
 RESAMPLES = 2000
 
@@ -36,8 +36,8 @@ def ratio_interval(hits: np.ndarray, trials: np.ndarray, *, seed: int = 0) -> tu
 def write(out: pathlib.Path, values: dict[str, Any], *, settings: dict[str, Any]) -> None:
     """Write `metrics.json` (flat keys; null where there was nothing to count) and `settings.json` to `out`."""
     finite = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in values.items()}
-    records.write_json(out / "settings.json", {**settings, "versions": records.package_versions()})
-    records.write_json(out / "metrics.json", finite)
+    files.write_json(out / "settings.json", {**settings, "versions": files.package_versions()})
+    files.write_json(out / "metrics.json", finite)
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:
@@ -46,4 +46,4 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     Raises:
       UserError: there are none.
     """
-    return records.read_json(folder / "metrics.json")
+    return files.read_json(folder / "metrics.json")

@@ -15,7 +15,7 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import records
+from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.workspace import WORKSPACE
 from eval import metrics
@@ -35,7 +35,7 @@ def write(
     random: pathlib.Path | None,
     runs: list[pathlib.Path],
 ) -> dict[str, Any]:
-    """Read everything, then write `report.html`, its pictures and `metrics.json` to `out` and return the merged metrics.
+    """Read everything, then write `report.html`, its pictures and `metrics.json`; returns the merged metrics.
 
     Args:
       out: folder.
@@ -69,21 +69,19 @@ def write(
             figures["curves"] = _curves(runs)
             parts.append("<h2>Learning curves</h2>{curves}")
     except (KeyError, TypeError) as error:
-        raise UserError(
-            f"report: a folder lacks {error}; give the --out of the dipn-eval command it is named after"
-        ) from None
+        raise UserError(f"report: a folder lacks {error}; give the folders that dipn-eval wrote") from None
     if not parts:
         raise UserError("report: nothing to report; give --prediction, --grasp, --hard, --random or --runs")
     body = "".join(parts)
     for name, figure in figures.items():
         body = body.replace(f"{{{name}}}", _image(figure, out / "pictures" / f"{name}.png"))
-    versions = ", ".join(f"{k} {v}" for k, v in records.package_versions().items())
+    versions = ", ".join(f"{k} {v}" for k, v in files.package_versions().items())
     page = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>dipn-jax report</title><style>{_STYLE}</style>'
         f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {html.escape(versions)}.</p></html>\n'
     )
-    records.write_atomically(out / "report.html", page.encode())
-    records.write_json(out / "metrics.json", values)
+    files.write_atomically(out / "report.html", page.encode())
+    files.write_json(out / "metrics.json", values)
     return values
 
 
@@ -157,7 +155,7 @@ def _image(figure: Any, path: pathlib.Path) -> str:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)
-    records.write_atomically(path, stream.getvalue())
+    files.write_atomically(path, stream.getvalue())
     return f'<img alt="{path.stem}" src="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}">'
 
 
@@ -205,7 +203,7 @@ def _prediction_film(films: Any) -> Any:
 def _filmstrip(folder: pathlib.Path) -> Any:
     """Some steps of the tables of a `dipn-eval clear`: pushes first."""
     steps = []
-    for entry in records.read_json(folder / "episodes.json", wanted=list):
+    for entry in files.read_json(folder / "episodes.json", wanted=list):
         film = _load(folder / entry["file"])
         steps += [(entry, i, {key: film[key][i] for key in film.files}) for i in range(len(film["what"]))]
     steps.sort(key=lambda s: (str(s[2]["what"]) != "push", s[1]))

@@ -8,7 +8,7 @@ import pickle
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import checkpoint, records
+from dipn_jax import checkpoint, files
 
 
 class Partial:
@@ -25,7 +25,7 @@ class Partial:
         self.path = out / "partial.pickle"
         content = [_fingerprint(path) for path in inputs]
         named = {k: str(v) for k, v in settings.items()}
-        self.identity = json.dumps([named, content, records.package_versions()])
+        self.identity = json.dumps([named, content, files.package_versions()])
 
     def load(self, fresh: Any) -> Any:
         """The state kept, or `fresh` where there is none for these settings."""
@@ -37,7 +37,7 @@ class Partial:
 
     def save(self, state: Any) -> None:
         """Keep `state` (anything that pickles), atomically."""
-        records.write_atomically(self.path, pickle.dumps((self.identity, state)))
+        files.write_atomically(self.path, pickle.dumps((self.identity, state)))
 
     def finish(self) -> None:
         """The results are written: drop the state."""
@@ -47,6 +47,6 @@ class Partial:
 def _fingerprint(path: pathlib.Path) -> str:
     """Of a file, or of the newest checkpoint of a run."""
     if path.is_file():
-        return records.file_sha256(path)
+        return files.file_sha256(path)
     found = checkpoint.newest(path)
-    return records.file_sha256(found[0] / "meta.json") if found else "none"
+    return files.file_sha256(found[0] / "meta.json") if found else "none"

@@ -17,7 +17,7 @@ import optax
 import tensorboardX
 from flax import nnx
 
-from dipn_jax import checkpoint, console, records
+from dipn_jax import checkpoint, console, files
 from dipn_jax.errors import UserError
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
@@ -120,7 +120,7 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
     console.require_out(out)
     optimizer = _optimizer(config)
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
-    records.claim(out, _identity(task, config, initial))
+    files.claim(out, _identity(task, config, initial))
     graph, params, rest = _split(model)
     moments, begin = optimizer.init(params), 0
     found = checkpoint.newest(out)
@@ -196,7 +196,7 @@ class _Log:
         self.path = out / "metrics.jsonl"
         old = self.path.read_text().splitlines() if self.path.exists() else []
         kept = [line for line in old if _step_of(line) <= begin]
-        records.write_atomically(self.path, "".join(line + "\n" for line in kept).encode())
+        files.write_atomically(self.path, "".join(line + "\n" for line in kept).encode())
         self.events = tensorboardX.SummaryWriter(str(out / "events"), purge_step=begin)
 
     def write(self, step: int, values: dict[str, float]) -> None:

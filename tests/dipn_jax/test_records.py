@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from dipn_jax import records
+from dipn_jax import files, records
 from dipn_jax.errors import UserError
 
 
@@ -98,13 +98,13 @@ def test_the_fingerprint_follows_the_content(copy: pathlib.Path) -> None:
 
 def test_a_write_that_dies_leaves_the_old_file(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "manifest.json"
-    records.write_json(path, {"a": 1})
+    files.write_json(path, {"a": 1})
 
     def die(self: pathlib.Path, target: pathlib.Path) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pathlib.Path, "rename", die)
     with pytest.raises(KeyboardInterrupt):
-        records.write_json(path, {"a": 2})
+        files.write_json(path, {"a": 2})
     assert json.loads(path.read_text()) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["manifest.json"]

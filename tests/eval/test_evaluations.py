@@ -70,11 +70,20 @@ def test_summary_counts_as_the_paper_does() -> None:
 
 def test_a_case_that_does_not_come_to_rest_is_named(engine: Any, tmp_path: pathlib.Path) -> None:
     box = {"shape": "cuboid", "size_mm": [50, 50, 50], "position_m": [0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
-    edge = box | {"position_m": [0.223, 0], "height_m": 0.3, "quaternion_wxyz": [0.9, 0.3, 0.3, 0]}
+    pair = [box | {"position_m": [0.18, 0]}, box | {"position_m": [0.22, 0]}]  # they overlap: one is thrown out
     path = tmp_path / "cases.json"
-    path.write_text(json.dumps({"cases": [{"name": "a", "objects": [box]}, {"name": "b/..", "objects": [edge]}]}))
+    path.write_text(
+        json.dumps(
+            {
+                "cases": [
+                    {"name": "a", "objects": [box]},
+                    {"name": "b/..", "objects": pair},
+                ]
+            }
+        )
+    )
     with pytest.raises(UserError, match=r"case b/\.\. of .* does not come to rest"):
-        clearing.hard_instances(engine, path, None, slots=1, repeats=1, seed=0)
+        clearing.hard_instances(engine, path, None, slots=2, repeats=1, seed=0)
 
 
 def test_prediction_measures_the_baselines_as_they_are(
@@ -115,11 +124,16 @@ def test_grasp_evaluation_writes_what_it_promises(
 
 @pytest.fixture(scope="module")
 def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Two hard cases acted on by networks that know nothing, so that every kind of step occurs."""
+    """Two hard cases acted on by networks that know nothing: one by grasps, one by pushes."""
     out = tmp_path_factory.mktemp("clear")
-    tables = clearing.hard_instances(engine, scenes.hard_cases_path(), ["06", "10"], slots=6, repeats=1, seed=0)
-    config = clearing.ClearConfig(candidates=4, threshold=2.0, gamma=1.05)
     predictor, scorer = policy.load_predictor(runs["dipn"], 6), policy.load_scorer(runs["grasp"])
+
+    def table(name: str) -> list[clearing.Instance]:
+        return clearing.hard_instances(engine, scenes.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
+
+    grasps = clearing.ClearConfig(candidates=4, threshold=0.0)
+    grasped = clearing.clear(table("06"), engine, predictor, scorer, grasps, Partial(out, {"case": "06"}), seed=0)
+    tables, config = table("10"), clearing.ClearConfig(candidates=4, threshold=2.0, gamma=1.05)
     # interrupted after the second turn, then taken up by a fresh call
     partial = Partial(out, {})
     save = partial.save
@@ -134,6 +148,7 @@ def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest
         clearing.clear(copy.deepcopy(tables), engine, predictor, scorer, config, partial, seed=0)
     tables = clearing.clear(tables, engine, predictor, scorer, config, Partial(out, {}), seed=0)
     assert Partial(out, {"other": 1}).load("fresh") == "fresh"
+    tables = grasped + tables
     clearing.save(tables, out)
     metrics.write(out, clearing.summary(tables), settings={})
     return tables, out
