@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import candidates, clutter, primitives, records, scenes
+from dipn_jax import candidates, clutter, primitives, scenes, structs
 from dipn_jax.physics import Engine
 from dipn_jax.structs import (
     Fault,
@@ -34,7 +34,7 @@ class Batch:
 def _padded(items: SettledScene) -> tuple[SettledScene, int]:
     """Repeat scenes up to clutter.BATCH, so that compiled shapes stay few; also the true number."""
     n = len(items.fault)
-    return records.take(items, np.arange(clutter.BATCH) % n), n
+    return structs.take(items, np.arange(clutter.BATCH) % n), n
 
 
 def push_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
@@ -48,7 +48,7 @@ def push_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, co
     pushes, feasible = _aim_pushes(jax.random.split(aim, clutter.BATCH), observation, actions, config.slots)
     keep = np.asarray(feasible)[:n].reshape(-1)
     pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:])[keep], pushes)
-    repeated = records.take(items, np.repeat(np.arange(n), actions)[keep])
+    repeated = structs.take(items, np.repeat(np.arange(n), actions)[keep])
     counts["infeasible_pushes"] = int((~keep).sum())
     if not keep.any():
         return Batch(None, counts)
@@ -76,7 +76,7 @@ def grasp_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, c
     observation = clutter.observe(padded.scene, padded.poses)
     grasps = _aim_grasps(jax.random.split(aim, clutter.BATCH), observation, actions)
     grasps = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:]), grasps)
-    repeated = records.take(items, np.repeat(np.arange(n), actions))
+    repeated = structs.take(items, np.repeat(np.arange(n), actions))
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
     episodes = GraspEpisode(
         repeated.scene,
@@ -105,7 +105,7 @@ def _drop_unusable(episodes: Any, counts: dict[str, int]) -> Batch:
     fault = episodes.fault
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})
     good = (fault & Fault.UNUSABLE) == 0
-    return Batch(records.take(episodes, good) if good.any() else None, counts)
+    return Batch(structs.take(episodes, good) if good.any() else None, counts)
 
 
 MAKERS = {"push": push_batch, "grasp": grasp_batch, "images": image_batch}

@@ -1,4 +1,6 @@
-"""Episodes -> shards. A shard is a pure function of (config, shard index): any worker, any time, the same bytes."""
+"""Episodes -> shards. A shard is a pure function of (config, shard index): any worker, any time, the same
+bytes (from the same versions, on the same kind of processor).
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from typing import Any
 import jax
 
 from datagen import episodes
-from dipn_jax import clutter, console, files, records
+from dipn_jax import clutter, console, files, records, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, EngineName, make_engine, resolve
 from dipn_jax.scenes import SceneConfig
@@ -66,10 +68,10 @@ def shard(job: Job, index: int, engine: Engine, progress: console.Progress) -> t
             raise UserError(f"no usable episode in {MAX_ATTEMPTS} batches ({dict(counts)}); loosen the scene config")
         if batch.episodes is not None:
             fresh = min(len(batch.episodes.fault), want - have)
-            done.append(records.take(batch.episodes, slice(0, fresh)))
+            done.append(structs.take(batch.episodes, slice(0, fresh)))
             have += fresh
             progress.advance(fresh, f"{counts['dropped_scenes']} scenes let fall")
-    return records.concatenate(done), dict(counts)
+    return structs.concatenate(done), dict(counts)
 
 
 def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1) -> None:

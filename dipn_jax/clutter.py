@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import primitives, records, render, scenes
+from dipn_jax import primitives, render, scenes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Array, Fault, Observation, Scene, SettledScene
@@ -34,12 +34,12 @@ def settled(
       The scenes kept `[K]`, and how many were dropped and why others were not kept.
     """
     made = _random_scenes(jax.random.split(key, BATCH), config)
-    scene, poses = records.take(made, slice(0, count))
+    scene, poses = structs.take(made, slice(0, count))
     rollout = primitives.settle(engine, scene, poses)
     fault = np.asarray(rollout.fault)
     everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)
     counts = {f"settle_{name}": n for name, n in Fault.count(fault).items()}
-    return records.take(everything, fault == 0), {"dropped_scenes": count, **counts}
+    return structs.take(everything, fault == 0), {"dropped_scenes": count, **counts}
 
 
 def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
@@ -59,8 +59,8 @@ def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, 
             raise UserError(
                 f"scenes: {in_vain} drops, none at rest inside the workspace ({counts}); ask for fewer objects"
             )
-        kept.append(records.take(batch, slice(0, missing)))
-    return records.concatenate(kept)
+        kept.append(structs.take(batch, slice(0, missing)))
+    return structs.concatenate(kept)
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -58,7 +58,7 @@ def push_trajectory(push: Push) -> Trajectory:
 
 
 def push_samples() -> np.ndarray:
-    """Seconds `[12]`: at 0..10 cm of a 10 cm push, and at rest."""
+    """Seconds `[12]`: at each tenth of the push (each centimetre of a 10 cm push), and at rest."""
     begin = DESCEND_TIME + 0.1
     travel = begin + np.arange(PUSH_STEPS + 1) * 0.01 / PUSH_SPEED
     return np.append(travel, travel[-1] + 0.1 + DESCEND_TIME + REST_TIME)
@@ -88,7 +88,7 @@ def settle(engine: Engine, scenes: Scene, poses: Array, *, duration: float = SET
 
 
 def push(engine: Engine, scenes: Scene, poses: Array, pushes: Push) -> Rollout:
-    """Execute one push a scene; `poses [B, 12, N, 7]`: at each centimetre and at rest."""
+    """Execute one push a scene; `poses [B, 12, N, 7]`: at each tenth of its distance and at rest."""
     return engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(), settle=True)
 
 

@@ -282,13 +282,3 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
     episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *shards)
     text = json.dumps([entry["sha256"] for entry in manifest["shards"].values()])
     return episodes, hashlib.sha256(text.encode()).hexdigest()
-
-
-def concatenate(batches: list[Any]) -> Any:
-    """Structs with a leading axis, joined along it, as numpy."""
-    return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *batches)
-
-
-def take(episodes: Any, index: np.ndarray | slice | int) -> Any:
-    """Episodes `index` of a batched struct, as numpy."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], episodes)

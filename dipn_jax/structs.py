@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any, ClassVar, TypeAlias
 
 import flax.struct
+import jax
 import numpy as np
 
 Array: TypeAlias = Any
@@ -173,3 +174,13 @@ class Decision(Pytree):
     feasible: Array  # [P] bool
     values: Array  # [P] gamma times the mean score after each candidate
     motion: Array  # [N, 3] predicted dx, dy (metres), dtheta (radians) for the best push
+
+
+def concatenate(batches: list[Any]) -> Any:
+    """Structs with a leading axis, joined along it, as numpy."""
+    return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *batches)
+
+
+def take(episodes: Any, index: np.ndarray | slice | int) -> Any:
+    """Episodes `index` of a batched struct, as numpy."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], episodes)

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import candidates, clutter, console, files, planner, policy, primitives, records, render, scenes
+from dipn_jax import candidates, clutter, console, files, planner, policy, primitives, render, scenes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Decision, Fault, Observation, Push, Rollout, Scene
@@ -65,7 +65,7 @@ def hard_instances(
     if missing:
         raise UserError(f"cases {missing}: not in {path}; it has {found}")
     index = np.array([found.index(name) for name in wanted for _ in range(repeats)])
-    scene, poses = records.take(scene, index), poses[index].copy()
+    scene, poses = structs.take(scene, index), poses[index].copy()
     rng = np.random.default_rng(seed)
     varied = np.arange(len(index)) % repeats > 0
     poses[varied, :, :2] += rng.uniform(-0.002, 0.002, poses[varied, :, :2].shape)
@@ -94,7 +94,7 @@ def random_instances(engine: Engine, config: scenes.SceneConfig, *, count: int, 
 
 def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instance]:
     return [
-        Instance(name, records.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
+        Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
         for i, name in enumerate(names)
     ]
 
@@ -203,7 +203,7 @@ def _grasp(rows: Acting, engine: Engine) -> None:
         instance.held += bool(held[i].any())
         instance.ended = "fault" if wrong[i] else ""
         instance.removed += int(held[i].sum())
-        instance.scene, instance.poses = records.take(scene, i), rested[i]
+        instance.scene, instance.poses = structs.take(scene, i), rested[i]
         _remember(instance, seen, decision, "grasp held" if held[i].any() else "grasp missed")
 
 

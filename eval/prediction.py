@@ -20,9 +20,9 @@ from dipn_jax import (
     losses,
     policy,
     primitives,
-    records,
     render,
     shapes,
+    structs,
 )
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Predictor
@@ -78,7 +78,7 @@ def evaluate(
             pushes, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)
             items, pushes, truth, rolled = _execute(engine, items, pushes, np.asarray(feasible), physics)
             for i in range(len(pushes.angle)):
-                scene, push = records.take(items.scene, i), records.take(pushes, i)
+                scene, push = structs.take(items.scene, i), structs.take(pushes, i)
                 for centimetres in DISTANCES:
                     push = push.replace(distance=np.float32(centimetres * 0.01))
                     arrays = (scene, push, truth[i, 0], truth[i, centimetres])
@@ -100,7 +100,7 @@ def _execute(
     engine: Engine, items: SettledScene, pushes: Push, feasible: np.ndarray, physics: bool
 ) -> tuple[SettledScene, Push, np.ndarray, np.ndarray | None]:
     """The feasible pushes whose simulation went well, what they did `[B, 12, N, 7]`, and what nominal ones did."""
-    items, pushes = records.take(items, feasible), records.take(pushes, feasible)
+    items, pushes = structs.take(items, feasible), structs.take(pushes, feasible)
     if not feasible.any():
         return items, pushes, np.zeros((0,)), None
     result = primitives.push(engine, items.scene, items.poses, pushes)
@@ -108,7 +108,7 @@ def _execute(
     rolled = None
     if physics:
         rolled = np.asarray(primitives.push(engine, _nominal(items.scene), items.poses, pushes).poses)[good]
-    return records.take(items, good), records.take(pushes, good), np.asarray(result.poses)[good], rolled
+    return structs.take(items, good), structs.take(pushes, good), np.asarray(result.poses)[good], rolled
 
 
 @jax.jit

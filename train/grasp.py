@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import geometry, losses, records, render
+from dipn_jax import geometry, losses, records, render, structs
 from dipn_jax.networks import grasp
 from dipn_jax.structs import Grasp, GraspEpisode, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
@@ -54,7 +54,7 @@ class PretrainTask:
 
     def fetch(self, index: np.ndarray) -> SettledScene:
         """See `loop.Task`."""
-        return records.take(self.train_set, index)
+        return structs.take(self.train_set, index)
 
     def views(self, scenes: SettledScene, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Images `[B, V, V, 4]`, labels `[B, V, V]` and weights `[B, V, V]` of random views."""
@@ -79,7 +79,7 @@ class PretrainTask:
         """See `loop.Task`: loss on views of held-out scenes."""
         graph, state = nnx.split(model)
         index = np.arange(min(16, len(self.test_set.fault)))
-        loss = self._measure(graph, state, records.take(self.test_set, index))
+        loss = self._measure(graph, state, structs.take(self.test_set, index))
         return {"held_out_loss": float(loss)}
 
     @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -102,7 +102,7 @@ class GraspTask:
 
     def fetch(self, index: np.ndarray) -> GraspEpisode:
         """See `loop.Task`."""
-        return records.take(self.train_set, index)
+        return structs.take(self.train_set, index)
 
     def windows(self, episodes: GraspEpisode, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Images `[B, W, W, 4]` and the executed pixel `[B, 2]` (row, col), near the middle.
@@ -140,7 +140,7 @@ class GraspTask:
         for begin in range(0, len(self.test_set.fault), size):
             index = np.arange(begin, begin + size) % len(self.test_set.fault)
             weight = np.arange(begin, begin + size) < len(self.test_set.fault)
-            rows.append([float(v) for v in self._measure(graph, state, records.take(self.test_set, index), weight)])
+            rows.append([float(v) for v in self._measure(graph, state, structs.take(self.test_set, index), weight)])
         loss, correct, count = np.array(rows).sum(0)
         return {"held_out_loss": loss / count, "accuracy": correct / count}
 

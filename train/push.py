@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import geometry, losses, records, render
+from dipn_jax import geometry, losses, records, render, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn
 from dipn_jax.structs import PushEpisode
@@ -42,7 +42,7 @@ class PushTask:
         if limit is not None and not 2 <= limit <= count:
             raise UserError(f"--limit {limit}: want 2 to {count}, the number of episodes in {data}")
         count = count if limit is None else limit
-        self.train_set, self.test_set = split(records.take(episodes, slice(0, count)), data)
+        self.train_set, self.test_set = split(structs.take(episodes, slice(0, count)), data)
         self.network_config = config
         self.size = len(self.train_set.fault)
         self.fingerprint = f"{fingerprint}:{count}:{centimetres}"
@@ -51,7 +51,7 @@ class PushTask:
 
     def fetch(self, index: np.ndarray) -> PushEpisode:
         """See `loop.Task`."""
-        return records.take(self.train_set, index)
+        return structs.take(self.train_set, index)
 
     def prepare(self, episodes: PushEpisode, centimetres: jax.Array) -> tuple[dipn.PushInput, jax.Array]:
         """Inputs `[B]` and targets `[B, N, 3]` (pixels, degrees, push frame) at `centimetres [B]`."""
@@ -82,7 +82,7 @@ class PushTask:
         for begin in range(0, len(self.test_set.fault), size):
             index = np.arange(begin, begin + size) % len(self.test_set.fault)
             weight = np.arange(begin, begin + size) < len(self.test_set.fault)
-            episodes = records.take(self.test_set, index)
+            episodes = structs.take(self.test_set, index)
             loss, error, moved = self._measure(graph, state, episodes, jnp.asarray(weight))
             total["held_out_loss"].append((float(loss), int(weight.sum())))
             total["moved_error_mm"].append((float(error), float(moved)))

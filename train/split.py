@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import records
+from dipn_jax import structs
 from dipn_jax.errors import UserError
 
 
@@ -27,4 +27,4 @@ def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
         raise UserError(f"data set {data}: {len(size)} examples of one scene; want at least two scenes")
     wanted = len(size) - max(1, len(size) // 10)
     cut = int(begins[np.argmin(np.abs(begins - wanted))])
-    return records.take(episodes, slice(0, cut)), records.take(episodes, slice(cut, len(size)))
+    return structs.take(episodes, slice(0, cut)), structs.take(episodes, slice(cut, len(size)))

@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import candidates, geometry, records, render
+from dipn_jax import candidates, geometry, render, structs
 from dipn_jax.structs import ABSENT, Observation
 
 
 def _seen(settled: Any, index: int = 0) -> Observation:
-    return render.render(records.take(settled.scene, index), settled.poses[index])
+    return render.render(structs.take(settled.scene, index), settled.poses[index])
 
 
 def test_contour_is_opencvs(settled: Any) -> None:

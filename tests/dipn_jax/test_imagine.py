@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import candidates, geometry, imagine, losses, records, render
+from dipn_jax import candidates, geometry, imagine, losses, render, structs
 from dipn_jax.structs import ABSENT
 
 
 def _seen(settled: Any, index: int) -> Any:
-    scene = records.take(settled.scene, index)
+    scene = structs.take(settled.scene, index)
     return scene, render.render(scene, settled.poses[index])
 
 

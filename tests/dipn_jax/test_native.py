@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import physics, primitives, records, scenes, shapes
+from dipn_jax import physics, primitives, scenes, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import native
 from dipn_jax.structs import Fault, Grasp, Push, Scene
@@ -96,7 +96,7 @@ def test_results_do_not_depend_on_threads_or_neighbours(settled: Any) -> None:
     b = primitives.push(two, settled.scene, settled.poses, pushes)
     np.testing.assert_array_equal(a.poses, b.poses)
     alone = primitives.push(
-        one, records.take(settled.scene, slice(2, 3)), settled.poses[2:3], records.take(pushes, slice(2, 3))
+        one, structs.take(settled.scene, slice(2, 3)), settled.poses[2:3], structs.take(pushes, slice(2, 3))
     )
     np.testing.assert_array_equal(alone.poses[0], a.poses[2])
 

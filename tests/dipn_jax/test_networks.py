@@ -9,7 +9,7 @@ import optax
 import pytest
 from flax import nnx
 
-from dipn_jax import geometry, losses, records, render
+from dipn_jax import geometry, losses, render, structs
 from dipn_jax.networks import dipn, grasp
 from dipn_jax.structs import ABSENT, Push
 from dipn_jax.workspace import grasp_angles
@@ -59,7 +59,7 @@ def test_the_push_starts_at_pixel_40_112_and_goes_to_plus_x() -> None:
 
 
 def test_the_push_frame_is_opencvs_warp(settled: Any) -> None:
-    _, label = render.render_depth(records.take(settled.scene, 0), settled.poses[0])
+    _, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     push = _push()
     made, _ = dipn.push_input(label, push, slots=SLOTS, stride=1)
     c, s = np.cos(0.4), np.sin(0.4)
@@ -115,7 +115,7 @@ def test_batch_elements_do_not_interact(forward: Any, inputs: dipn.PushInput) ->
 @pytest.mark.parametrize("stride", [1, 2])
 def test_the_mirror_of_an_input_is_the_input_of_the_mirror(stride: int, settled: Any) -> None:
     # a push along +x through the middle of the map: mirroring the scene is flipping the map's rows
-    _, label = render.render_depth(records.take(settled.scene, 0), settled.poses[0])
+    _, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     push = _push(x=-0.143, y=0.0, angle=0.0)
     make = functools.partial(dipn.push_input, slots=SLOTS, stride=stride)
     direct = dipn.mirror(jax.tree.map(lambda leaf: leaf[None], make(label, push)[0]))
@@ -173,7 +173,7 @@ def _one_step(model: Any, loss: Any) -> tuple[float, float]:
 @pytest.mark.slow
 def test_paper_dipn_takes_a_training_step(settled: Any) -> None:
     model = dipn.DIPN(dipn.DipnConfig(preset="paper"), rngs=nnx.Rngs(0))
-    _, label = render.render_depth(records.take(settled.scene, 0), settled.poses[0])
+    _, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     made, _ = dipn.push_input(label, _push(), slots=SLOTS, stride=1)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
     target = jnp.ones((2, SLOTS, 3))

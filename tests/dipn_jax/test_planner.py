@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import candidates, planner, policy, records, render
+from dipn_jax import candidates, planner, policy, render, structs
 from dipn_jax.structs import Observation, Push
 
 SLOTS, COUNT = 5, 8
@@ -46,7 +46,7 @@ def away(observation: Observation, pushes: Push) -> jax.Array:
 
 @pytest.fixture(scope="module")
 def seen(settled: Any) -> Observation:
-    return render.render(records.take(settled.scene, 0), settled.poses[0])
+    return render.render(structs.take(settled.scene, 0), settled.poses[0])
 
 
 def _decide(seen: Observation, predictor: Any, scorer: Any, **options: Any) -> Any:

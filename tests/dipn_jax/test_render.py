@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dipn_jax import geometry, model, records, render
+from dipn_jax import geometry, model, render, structs
 from dipn_jax.structs import ABSENT
 
 
@@ -32,7 +32,7 @@ def raycast(scene: Any, poses: np.ndarray, pixels: int) -> tuple[np.ndarray, np.
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_heights_and_labels_are_the_ray_casters(settled: Any, index: int) -> None:
-    scene, poses = records.take(settled.scene, index), settled.poses[index]
+    scene, poses = structs.take(settled.scene, index), settled.poses[index]
     height, label = render.render_depth(scene, poses)
     want_height, want_label = raycast(scene, poses, 224)
     assert (np.asarray(label) == want_label).mean() > 0.9999
@@ -43,12 +43,12 @@ def test_heights_and_labels_are_the_ray_casters(settled: Any, index: int) -> Non
 
 def test_batch_elements_do_not_interact(settled: Any) -> None:
     together = jax.vmap(render.render_depth)(settled.scene, jnp.asarray(settled.poses))
-    alone = render.render_depth(records.take(settled.scene, 2), settled.poses[2])
+    alone = render.render_depth(structs.take(settled.scene, 2), settled.poses[2])
     np.testing.assert_array_equal(together[1][2], alone[1])
 
 
 def test_a_view_of_turned_poses_is_the_turned_view(settled: Any) -> None:
-    scene, poses = records.take(settled.scene, 0), jnp.asarray(settled.poses[0])
+    scene, poses = structs.take(settled.scene, 0), jnp.asarray(settled.poses[0])
     _, label = render.render_depth(scene, poses)
     turned = geometry.transform_poses(poses, -0.5, jnp.zeros(2))
     _, direct = render.render_depth(scene, turned, pixels=320)
@@ -69,7 +69,7 @@ def test_gradient_of_height_is_finite(settled: Any) -> None:
 
 
 def test_colors_follow_labels(settled: Any) -> None:
-    scene = records.take(settled.scene, 0)
+    scene = structs.take(settled.scene, 0)
     seen = render.render(scene, settled.poses[0])
     label = np.asarray(seen.label)
     want = np.concatenate([scene.color, [render.TABLE_COLOR]])[label]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint, policy, records, render, scenes
+from dipn_jax import checkpoint, policy, render, scenes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
@@ -101,7 +101,7 @@ def test_prediction_measures_the_baselines_as_they_are(
 
 
 def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> None:
-    scene, poses = records.take(settled.scene, 0), jnp.asarray(settled.poses[0])
+    scene, poses = structs.take(settled.scene, 0), jnp.asarray(settled.poses[0])
     after = poses.at[0, 0].add(0.01)
     push = Push(jnp.zeros(2), jnp.float32(0.0), jnp.float32(0.05))
     got = prediction._measurer(policy.static_predictor(5), 5)(scene, push, poses, after)
