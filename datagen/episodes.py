@@ -31,20 +31,27 @@ class Batch:
     counts: dict[str, int]
 
 
-def _padded(items: SettledScene) -> tuple[SettledScene, int]:
-    """Repeat scenes up to clutter.BATCH, so that compiled shapes stay few; also the true number."""
-    n = len(items.fault)
-    return structs.take(items, np.arange(clutter.BATCH) % n), n
+def _look(
+    key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int
+) -> tuple[SettledScene, Observation | None, dict[str, int]]:
+    """Settled scenes, what the camera sees of them (None if there are none), and counts.
+
+    Observations are `[clutter.BATCH]`, scenes repeated to fill them, so that compiled shapes stay few.
+    """
+    items, counts = clutter.settled(key, engine, config, count)
+    if not len(items.fault):
+        return items, None, counts
+    filled = structs.take(items, np.arange(clutter.BATCH) % len(items.fault))
+    return items, clutter.observe(filled.scene, filled.poses), counts
 
 
 def push_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
     """`actions` different 10 cm pushes on each of up to `count` settled scenes."""
     drop, aim = jax.random.split(key)
-    items, counts = clutter.settled(drop, engine, config, count)
-    if not len(items.fault):
+    items, observation, counts = _look(drop, engine, config, count)
+    if observation is None:
         return Batch(None, counts)
-    padded, n = _padded(items)
-    observation = clutter.observe(padded.scene, padded.poses)
+    n = len(items.fault)
     pushes, feasible = _aim_pushes(jax.random.split(aim, clutter.BATCH), observation, actions, config.slots)
     keep = np.asarray(feasible)[:n].reshape(-1)
     pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:])[keep], pushes)
@@ -69,11 +76,10 @@ def _aim_pushes(keys: jax.Array, observation: Observation, actions: int, slots: 
 def grasp_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
     """`actions` grasps at random foreground pixels and angles on each of up to `count` settled scenes."""
     drop, aim = jax.random.split(key)
-    items, counts = clutter.settled(drop, engine, config, count)
-    if not len(items.fault):
+    items, observation, counts = _look(drop, engine, config, count)
+    if observation is None:
         return Batch(None, counts)
-    padded, n = _padded(items)
-    observation = clutter.observe(padded.scene, padded.poses)
+    n = len(items.fault)
     grasps = _aim_grasps(jax.random.split(aim, clutter.BATCH), observation, actions)
     grasps = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:]), grasps)
     repeated = structs.take(items, np.repeat(np.arange(n), actions))

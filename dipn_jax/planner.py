@@ -21,6 +21,37 @@ Scorer = Callable[[jax.Array], jax.Array]
 """images [M, 224, 224, 4] -> scores [M, 16, 224, 224] in [0, 1]."""
 
 
+_Imagined = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+"""Values [P], image [H, W, 4] and motion [N, 3] of the best push, allowed [P]."""
+
+
+def _imagine_each(
+    observation: Observation,
+    pushes: Push,
+    feasible: jax.Array,
+    predictor: Predictor,
+    scorer: Scorer,
+    slots: int,
+    gamma: jax.Array | float,
+) -> _Imagined:
+    """Predict and score every candidate."""
+    centers, area = candidates.mask_centers(observation.label, slots)
+    motion = predictor(observation, pushes)
+    inside = jax.vmap(candidates.stays_inside, in_axes=(None, None, 0))(centers, area, motion)
+    allowed = feasible & inside
+    images = jax.lax.map(lambda m: render.rgbd(imagine.imagine(observation, centers, m)), motion)
+    mean = jax.lax.map(lambda image: scorer(image[None]).mean(), images)
+    value = jnp.where(allowed, gamma * mean, -jnp.inf)
+    best = jnp.argmax(value)
+    return value, images[best], motion[best], allowed
+
+
+def _imagine_none(observation: Observation, feasible: jax.Array, slots: int) -> _Imagined:
+    """What stands in for `_imagine_each` where no push is considered."""
+    value = jnp.full(feasible.shape, -jnp.inf)
+    return value, render.rgbd(observation), jnp.zeros((slots, 3)), feasible
+
+
 @functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "slots"))
 def decide(
     key: jax.Array,
@@ -54,25 +85,12 @@ def decide(
     now = scorer(render.rgbd(observation)[None])[0]
     index, best_score = candidates.best_grasp(now)
     pushes, feasible = candidates.sample_pushes(key, observation, count=count, slots=slots, distance=distance)
-    centers, area = candidates.mask_centers(observation.label, slots)
 
-    def consider(_: None) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        motion = predictor(observation, pushes)
-        inside = jax.vmap(candidates.stays_inside, in_axes=(None, None, 0))(centers, area, motion)
-        allowed = feasible & inside
-        images = jax.lax.map(lambda m: render.rgbd(imagine.imagine(observation, centers, m)), motion)
-        mean = jax.lax.map(lambda image: scorer(image[None]).mean(), images)
-        value = jnp.where(allowed, gamma * mean, -jnp.inf)
-        best = jnp.argmax(value)
-        return value, images[best], motion[best], allowed
-
-    def skip(_: None) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        value = jnp.full((count,), -jnp.inf)
-        return value, render.rgbd(observation), jnp.zeros((slots, 3)), feasible
-
+    consider = functools.partial(_imagine_each, observation, pushes, feasible, predictor, scorer, slots, gamma)
+    skip = functools.partial(_imagine_none, observation, feasible, slots)
     value_now = now.mean()
     short_cut = best_score > threshold
-    value, predicted, motion, allowed = jax.lax.cond(short_cut, skip, consider, None)
+    value, predicted, motion, allowed = jax.lax.cond(short_cut, skip, consider)
     best = jnp.argmax(value).astype(jnp.int32)
     return Decision(
         is_push=~short_cut & (value[best] > value_now),

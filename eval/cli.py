@@ -12,6 +12,7 @@ import tyro
 from dipn_jax import console, scenes
 from dipn_jax.physics import EngineName, make_engine
 from eval import clearing, grasping, metrics, prediction, resume
+from eval import instances as tables_to_clear
 from eval import report as reporting
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
@@ -147,9 +148,11 @@ def clear(
         slots = scenes.load_cases(path)[1].shape.shape[1]
     predictor, scorer = clearing.load_policies(config, push_net, grasp_net, slots)
     if cases == "random":
-        tables = clearing.random_instances(physics, scene_config, count=instances, seed=seed)
+        tables = tables_to_clear.random_instances(physics, scene_config, count=instances, seed=seed)
     else:
-        tables = clearing.hard_instances(physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed)
+        tables = tables_to_clear.hard_instances(
+            physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed
+        )
     inputs = [p for p in (push_net, grasp_net, None if cases == "random" else path) if p is not None]
     partial = resume.Partial(out, settings, inputs=inputs)
     tables = clearing.clear(tables, physics, predictor, scorer, config, partial, seed=seed)

@@ -108,28 +108,12 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
     Raises:
       UserError: the folder holds a run of another config or on other data.
     """
-    console.require_positive(
-        steps=config.steps,
-        batch=config.batch,
-        learning_rate=config.learning_rate,
-        eval_every=config.eval_every,
-        save_every=config.save_every,
-    )
-    console.require_between(0, 1, weight_decay=config.weight_decay)
-    console.require_seed(config.seed)
-    console.require_out(out)
+    _check(config, out)
     optimizer = _optimizer(config)
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
     files.claim(out, _identity(task, config, initial))
+    moments, begin = _resume(out, model, optimizer)
     graph, params, rest = _split(model)
-    moments, begin = optimizer.init(params), 0
-    found = checkpoint.newest(out)
-    if found:
-        folder, meta = found
-        begin = int(meta["step"])
-        nnx.update(model, checkpoint.restore(folder, "model", nnx.state(model)))
-        graph, params, rest = _split(model)
-        moments = checkpoint.restore(folder, "train", moments)
     order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
     step_fn = _make_step(task, graph, optimizer)
     log = _Log(out, begin)
@@ -166,6 +150,30 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
             progress.advance(1, " ".join(f"{k} {v:.3f}" for k, v in latest.items()))
     log.close()
     return latest or log.last()
+
+
+def _check(config: TrainConfig, out: pathlib.Path) -> None:
+    console.require_positive(
+        steps=config.steps,
+        batch=config.batch,
+        learning_rate=config.learning_rate,
+        eval_every=config.eval_every,
+        save_every=config.save_every,
+    )
+    console.require_between(0, 1, weight_decay=config.weight_decay)
+    console.require_seed(config.seed)
+    console.require_out(out)
+
+
+def _resume(out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTransformation) -> tuple[Any, int]:
+    """Optimizer state and step to begin with; the weights of an earlier part of the run go into `model`."""
+    moments = optimizer.init(_split(model)[1])
+    found = checkpoint.newest(out)
+    if found is None:
+        return moments, 0
+    folder, meta = found
+    nnx.update(model, checkpoint.restore(folder, "model", nnx.state(model)))
+    return checkpoint.restore(folder, "train", moments), int(meta["step"])
 
 
 def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.structs import Push
-from eval import clearing, grasping, metrics, prediction, report
+from eval import clearing, grasping, instances, metrics, prediction, report
 from eval.resume import Partial
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
@@ -47,8 +47,8 @@ def test_calibration_error_of_known_scores() -> None:
     assert grasping.calibration_error(np.full(10, 0.95), np.zeros(10)) == pytest.approx(0.95)
 
 
-def _ended(name: str, steps: list[str], removed: int, objects: int) -> clearing.Instance:
-    instance = clearing.Instance("x", None, np.zeros((1, 7)), objects)  # type: ignore[arg-type]
+def _ended(name: str, steps: list[str], removed: int, objects: int) -> instances.Instance:
+    instance = instances.Instance("x", None, np.zeros((1, 7)), objects)  # type: ignore[arg-type]
     instance.ended, instance.removed = name, removed
     instance.film = [{"what": step} for step in steps]
     instance.pushes, instance.held = steps.count("push"), steps.count("grasp held")
@@ -83,7 +83,7 @@ def test_a_case_that_does_not_come_to_rest_is_named(engine: Any, tmp_path: pathl
         )
     )
     with pytest.raises(UserError, match=r"case b/\.\. of .* does not come to rest"):
-        clearing.hard_instances(engine, path, None, slots=2, repeats=1, seed=0)
+        instances.hard_instances(engine, path, None, slots=2, repeats=1, seed=0)
 
 
 def test_prediction_measures_the_baselines_as_they_are(
@@ -128,8 +128,8 @@ def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest
     out = tmp_path_factory.mktemp("clear")
     predictor, scorer = policy.load_predictor(runs["dipn"], 6), policy.load_scorer(runs["grasp"])
 
-    def table(name: str) -> list[clearing.Instance]:
-        return clearing.hard_instances(engine, scenes.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
+    def table(name: str) -> list[instances.Instance]:
+        return instances.hard_instances(engine, scenes.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
 
     grasps = clearing.ClearConfig(candidates=4, threshold=0.0)
     grasped = clearing.clear(table("06"), engine, predictor, scorer, grasps, Partial(out, {"case": "06"}), seed=0)

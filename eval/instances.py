@@ -1,0 +1,83 @@
+"""The tables to clear: hand-placed cases with perturbed physics, and random clutter."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from dipn_jax import clutter, primitives, scenes, structs
+from dipn_jax.errors import UserError
+from dipn_jax.physics import Engine
+from dipn_jax.structs import Fault, Scene
+
+
+@dataclasses.dataclass
+class Instance:
+    """One table being cleared."""
+
+    name: str
+    scene: Scene  # numpy, [N]
+    poses: np.ndarray  # [N, 7]
+    objects: int
+    grasps: int = 0
+    pushes: int = 0
+    removed: int = 0
+    held: int = 0  # grasps that held something
+    ended: str = ""  # cleared, pushed out, out of actions, fault
+    film: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+
+    @property
+    def actions(self) -> int:
+        return self.grasps + self.pushes
+
+
+def hard_instances(
+    engine: Engine, path: pathlib.Path, names: list[str] | None, *, slots: int, repeats: int, seed: int
+) -> list[Instance]:
+    """The cases of a file, settled; `repeats` of each, all but the first moved by up to 2 mm and reweighed.
+
+    Raises:
+      UserError: a name is not in the file.
+    """
+    found, scene, poses = scenes.load_cases(path, slots=slots)
+    wanted = names or found
+    missing = [name for name in wanted if name not in found]
+    if missing:
+        raise UserError(f"cases {missing}: not in {path}; it has {found}")
+    index = np.array([found.index(name) for name in wanted for _ in range(repeats)])
+    scene, poses = structs.take(scene, index), poses[index].copy()
+    rng = np.random.default_rng(seed)
+    varied = np.arange(len(index)) % repeats > 0
+    poses[varied, :, :2] += rng.uniform(-0.002, 0.002, poses[varied, :, :2].shape)
+    factor = np.where(varied[:, None], rng.uniform(0.8, 1.2, scene.mass.shape), 1.0)
+    rub = np.where(varied[:, None], rng.uniform(0.85, 1.15, scene.mass.shape), 1.0)
+    scene = scene.replace(
+        mass=(scene.mass * factor).astype(np.float32), friction=(scene.friction * rub).astype(np.float32)
+    )
+    rollout = primitives.settle(engine, scene, poses)
+    wrong = np.flatnonzero(np.asarray(rollout.fault) & (Fault.UNUSABLE | Fault.OUTSIDE))
+    if len(wrong):
+        first = wrong[0]
+        what = [name for name, hit in Fault.count(rollout.fault[first : first + 1]).items() if hit]
+        raise UserError(
+            f"case {found[index[first]]} of {path}: does not come to rest in the workspace ({', '.join(what)}); "
+            "objects that overlap or stand at its edge must be moved"
+        )
+    return _instances([found[i] for i in index], scene, np.asarray(rollout.poses)[:, -1])
+
+
+def random_instances(engine: Engine, config: scenes.SceneConfig, *, count: int, seed: int) -> list[Instance]:
+    """`count` random settled scenes."""
+    items = clutter.settled_exactly(jax.random.key(seed), engine, config, count)
+    return _instances([f"random-{i}" for i in range(count)], items.scene, items.poses)
+
+
+def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instance]:
+    return [
+        Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
+        for i, name in enumerate(names)
+    ]
