@@ -21,6 +21,10 @@ PAPER_COUNTS = (0.02, 0.05, 0.2, 0.35, 0.3, 0.05, 0.03)
 """P(1..7 objects) of the push data. Source: DIPN's released code."""
 
 
+MIN_SIDE = 0.025
+"""Metres: no side is thinner. The fingertips stop 20 mm above the table, and 2.5 mm of pad cannot hold a box."""
+
+
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
     """What random scenes are made of."""
@@ -92,6 +96,7 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
     item = jax.random.randint(keys[1], (n,), 0, len(items))
     shape = jnp.where(present, classes[item], ABSENT)
     size = nominal[item] * jax.random.uniform(keys[2], (n, 3), minval=config.scale[0], maxval=config.scale[1])
+    size = jnp.maximum(size, MIN_SIDE)
     diagonal = jnp.linalg.norm(size, axis=-1, keepdims=True)
     size = size * jnp.minimum(1.0, shapes.MAX_DIAGONAL / diagonal)
     colors = jnp.array(shapes.COLORS_RGB, jnp.float32) / 255
