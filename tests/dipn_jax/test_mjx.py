@@ -45,8 +45,6 @@ LINES = (
 @pytest.fixture(scope="session")
 def engine() -> MjxEngine:
     """One engine for the file: its only program takes most of the time."""
-    if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", "/tmp/dipn-jax-tests")
     return MjxEngine()
 
 
