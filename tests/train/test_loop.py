@@ -96,7 +96,7 @@ def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tm
     rate = task.train_set.success.mean()
     entropy = -(rate * np.log(rate) + (1 - rate) * np.log(1 - rate))
     loss = _loss(task, checkpoint.load_network(tmp_path / "b", network="grasp"), 20)
-    assert loss < 0.8 * entropy
+    assert loss < 0.6 * entropy  # a constant gets 1.0
 
 
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
