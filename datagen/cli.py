@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pathlib
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -17,22 +18,47 @@ from dipn_jax.physics import EngineName
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
 
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """Which engine makes a data set, and which part of it."""
+
+    engine: EngineName = "auto"
+    """native (CPU), mjx (XLA), or auto."""
+    timestep: float | None = None
+    """Seconds of a physics step; the engine's own if not given."""
+    shard: int = 0
+    """This worker's number."""
+    of: int = 1
+    """Number of workers; each makes every of-th shard of the same data set."""
+
+
+DEFAULT_WORK = Work()
+
+
+def _generate(kind: str, out: pathlib.Path, objects: str, ranges: scenes.Ranges, work: Work, **job: Any) -> None:
+    scene = scenes.parse_objects(objects, ranges=ranges)
+    made = Job(kind, scene, engine=work.engine, timestep=work.timestep, **job)
+    generate(made, out, part=work.shard, of=work.of)
+
+
 def push(
     out: pathlib.Path,
     episodes: int = 1500,
     objects: Objects = "paper",
     seed: int = 0,
     actions: int = 3,
+    distances: tuple[float, ...] = (0.10,),
     shard_size: int = 500,
-    engine: EngineName = "auto",
-    timestep: float | None = None,
-    shard: int = 0,
-    of: int = 1,
+    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
+    work: Work = DEFAULT_WORK,
 ) -> None:
     """Push episodes: a settled scene, one 10 cm push, poses at every centimetre.
 
     1,500 episodes take about two minutes on two cores:
       dipn-datagen push --out data/push --episodes 1500
+
+    The same pushes at three distances, each ended by its own retreat:
+      dipn-datagen push --out data/sweep --distances 0.03 0.06 0.1
 
     Args:
       out: folder of the data set; asking again continues or extends it.
@@ -40,14 +66,13 @@ def push(
       objects: number of objects in a scene.
       seed: seed of everything random.
       actions: different pushes tried on each settled scene.
+      distances: metres, up to 0.1; every push is made once for each of them, from the same settled scene.
       shard_size: episodes in a file; files are the unit of resuming and of sharing work.
-      engine: native (CPU), mjx (XLA), or auto.
-      timestep: seconds of a physics step; the engine's own if not given.
-      shard: this worker's number.
-      of: number of workers; each makes every of-th shard of the same data set.
+      ranges: what random objects are drawn from.
+      work: engine and share of the work.
     """
-    job = Job("push", scenes.parse_objects(objects), episodes, seed, shard_size, actions, engine, timestep)
-    generate(job, out, part=shard, of=of)
+    job = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions, "distances": distances}
+    _generate("push", out, objects, ranges, work, **job)
 
 
 def grasp(
@@ -57,10 +82,8 @@ def grasp(
     seed: int = 0,
     actions: int = 6,
     shard_size: int = 600,
-    engine: EngineName = "auto",
-    timestep: float | None = None,
-    shard: int = 0,
-    of: int = 1,
+    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
+    work: Work = DEFAULT_WORK,
 ) -> None:
     """Grasp episodes: a settled scene, one grasp at a random foreground pixel and angle, held or not.
 
@@ -74,13 +97,11 @@ def grasp(
       seed: seed of everything random.
       actions: different grasps tried on each settled scene.
       shard_size: episodes in a file.
-      engine: native (CPU), mjx (XLA), or auto.
-      timestep: seconds of a physics step; the engine's own if not given.
-      shard: this worker's number.
-      of: number of workers; each makes every of-th shard of the same data set.
+      ranges: what random objects are drawn from.
+      work: engine and share of the work.
     """
-    job = Job("grasp", scenes.parse_objects(objects), episodes, seed, shard_size, actions, engine, timestep)
-    generate(job, out, part=shard, of=of)
+    job = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions}
+    _generate("grasp", out, objects, ranges, work, **job)
 
 
 def images(
@@ -89,10 +110,8 @@ def images(
     objects: Objects = "10",
     seed: int = 0,
     shard_size: int = 100,
-    engine: EngineName = "auto",
-    timestep: float | None = None,
-    shard: int = 0,
-    of: int = 1,
+    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
+    work: Work = DEFAULT_WORK,
 ) -> None:
     """Settled scenes without an action, for GN's pre-training on images.
 
@@ -104,13 +123,10 @@ def images(
       objects: number of objects in a scene.
       seed: seed of everything random.
       shard_size: scenes in a file.
-      engine: native (CPU), mjx (XLA), or auto.
-      timestep: seconds of a physics step; the engine's own if not given.
-      shard: this worker's number.
-      of: number of workers; each makes every of-th shard of the same data set.
+      ranges: what random objects are drawn from.
+      work: engine and share of the work.
     """
-    job = Job("images", scenes.parse_objects(objects), episodes, seed, shard_size, 1, engine, timestep)
-    generate(job, out, part=shard, of=of)
+    _generate("images", out, objects, ranges, work, episodes=episodes, seed=seed, shard_size=shard_size, actions=1)
 
 
 def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:

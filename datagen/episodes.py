@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -45,8 +46,16 @@ def _look(
     return items, clutter.observe(filled.scene, filled.poses), counts
 
 
-def push_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
-    """`actions` different 10 cm pushes on each of up to `count` settled scenes."""
+def push_batch(
+    key: jax.Array,
+    engine: Engine,
+    config: scenes.SceneConfig,
+    *,
+    count: int,
+    actions: int,
+    distances: tuple[float, ...] = (PUSH_STEPS * 0.01,),
+) -> Batch:
+    """`actions` different pushes on each of up to `count` settled scenes, each once for every one of `distances`."""
     drop, aim = jax.random.split(key)
     items, observation, counts = _look(drop, engine, config, count)
     if observation is None:
@@ -55,10 +64,12 @@ def push_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, co
     pushes, feasible = _aim_pushes(jax.random.split(aim, clutter.BATCH), observation, actions, config.slots)
     keep = np.asarray(feasible)[:n].reshape(-1)
     pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:])[keep], pushes)
-    repeated = structs.take(items, np.repeat(np.arange(n), actions)[keep])
     counts["infeasible_pushes"] = int((~keep).sum())
     if not keep.any():
         return Batch(None, counts)
+    repeated = structs.take(items, np.repeat(np.arange(n), actions)[keep].repeat(len(distances)))
+    each = np.tile(np.asarray(distances, np.float32), int(keep.sum()))
+    pushes = structs.take(pushes, np.arange(int(keep.sum())).repeat(len(distances))).replace(distance=each)
     rollout = primitives.push(engine, repeated.scene, repeated.poses, pushes)
     poses = np.asarray(rollout.poses)
     episodes = PushEpisode(repeated.scene, poses[:, : PUSH_STEPS + 1], poses[:, -1], pushes, np.asarray(rollout.fault))
@@ -73,7 +84,9 @@ def _aim_pushes(keys: jax.Array, observation: Observation, actions: int, slots: 
     return jax.lax.map(one, (keys, observation))
 
 
-def grasp_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
+def grasp_batch(
+    key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int, **_: Any
+) -> Batch:
     """`actions` grasps at random foreground pixels and angles on each of up to `count` settled scenes."""
     drop, aim = jax.random.split(key)
     items, observation, counts = _look(drop, engine, config, count)
@@ -101,7 +114,7 @@ def _aim_grasps(keys: jax.Array, observation: Observation, actions: int) -> Gras
     return jax.lax.map(lambda args: candidates.random_grasps(args[0], args[1], count=actions), (keys, observation))
 
 
-def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int) -> Batch:
+def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, **_: Any) -> Batch:
     """Settled scenes, nothing done to them."""
     items, counts = clutter.settled(key, engine, config, count)
     return Batch(items if len(items.fault) else None, counts)
@@ -114,4 +127,4 @@ def _drop_unusable(episodes: Any, counts: dict[str, int]) -> Batch:
     return Batch(structs.take(episodes, good) if good.any() else None, counts)
 
 
-MAKERS = {"push": push_batch, "grasp": grasp_batch, "images": image_batch}
+MAKERS: dict[str, Callable[..., Batch]] = {"push": push_batch, "grasp": grasp_batch, "images": image_batch}

@@ -5,9 +5,11 @@ bytes (from the same versions, on the same kind of processor).
 from __future__ import annotations
 
 import collections
+import concurrent.futures
 import dataclasses
 import json
 import pathlib
+import threading
 from typing import Any
 
 import jax
@@ -17,11 +19,14 @@ from dipn_jax import clutter, console, files, records, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, EngineName, make_engine, resolve
 from dipn_jax.scenes import SceneConfig
+from dipn_jax.workspace import PUSH_STEPS
 
 MAX_ATTEMPTS = 100
 """Batches without a single usable episode before giving up."""
 MAX_ACTIONS = 256
 """Actions tried on one scene."""
+AT_ONCE = 2
+"""Shards in the making: the engine steps one of them at a time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +39,18 @@ class Job:
     seed: int
     shard_size: int
     actions: int
-    engine: EngineName
-    timestep: float | None  # seconds; the engine's own if None
+    engine: EngineName = "auto"
+    timestep: float | None = None  # seconds; the engine's own if None
+    distances: tuple[float, ...] = (PUSH_STEPS * 0.01,)  # metres: each push is made once for every one of them
+
+    def __post_init__(self) -> None:
+        console.require_positive(episodes=self.episodes, shard_size=self.shard_size, actions=self.actions)
+        console.require_between(1, MAX_ACTIONS, actions=self.actions)
+        console.require_seed(self.seed)
+        for distance in self.distances:
+            console.require_between(0.01, PUSH_STEPS * 0.01, distances=distance)
+        if not self.distances:
+            raise UserError("--distances: want at least one")
 
     def shards(self) -> int:
         """How many shards the data set has."""
@@ -50,57 +65,92 @@ class Job:
         return min(self.shard_size, self.episodes - index * self.shard_size)
 
 
-def shard(job: Job, index: int, engine: Engine, progress: console.Progress) -> tuple[Any, dict[str, int]]:
+class _Tally:
+    """What all shards at hand have counted, beside the progress bar. Threads share it."""
+
+    def __init__(self, progress: console.Progress) -> None:
+        self.progress, self.counts, self.lock = progress, collections.Counter[str](), threading.Lock()
+
+    def add(self, fresh: int, counts: dict[str, int]) -> None:
+        """`fresh` more episodes; `counts` of the batch they came from."""
+        with self.lock:
+            self.counts.update(counts)
+            faults = {name: n for name, n in sorted(self.counts.items()) if n and name != "dropped_scenes"}
+            said = ", ".join(f"{n} {name}" for name, n in faults.items()) or "no faults"
+            self.progress.advance(fresh, f"{self.counts['dropped_scenes']} scenes let fall; {said}")
+
+
+def shard(job: Job, index: int, engine: Engine, tally: _Tally) -> tuple[Any, dict[str, int]]:
     """The episodes of one shard and what was counted while making them."""
     want = job.size(index)
     key = jax.random.fold_in(jax.random.key(job.seed), index)
+    make = episodes.MAKERS[job.kind]
+    each = job.actions * (len(job.distances) if job.kind == "push" else 1)
     done: list[Any] = []
     counts: collections.Counter[str] = collections.Counter()
     have = empty = 0
     while have < want:
         key, batch_key = jax.random.split(key)
         # a tenth more than needed, for scenes that are dropped
-        count = min(clutter.BATCH, int(1.1 * (want - have) / job.actions) + 1)
-        batch = episodes.MAKERS[job.kind](batch_key, engine, job.scene, count=count, actions=job.actions)
+        count = min(clutter.BATCH, int(1.1 * (want - have) / each) + 1)
+        batch = make(batch_key, engine, job.scene, count=count, actions=job.actions, distances=job.distances)
         counts.update(batch.counts)
         empty = empty + 1 if batch.episodes is None else 0
         if empty == MAX_ATTEMPTS:
             raise UserError(f"no usable episode in {MAX_ATTEMPTS} batches ({dict(counts)}); loosen the scene config")
-        if batch.episodes is not None:
-            fresh = min(len(batch.episodes.fault), want - have)
+        fresh = 0 if batch.episodes is None else min(len(batch.episodes.fault), want - have)
+        if fresh:
             done.append(structs.take(batch.episodes, slice(0, fresh)))
-            have += fresh
-            progress.advance(fresh, f"{counts['dropped_scenes']} scenes let fall")
+        have += fresh
+        tally.add(fresh, batch.counts)
     return structs.concatenate(done), dict(counts)
 
 
 def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1) -> None:
     """Write the shards of `job` that are missing; `part` of `of` workers takes every `of`-th.
 
+    Two shards are in the making at any time: while the engine steps one, the scenes of the other are drawn, built,
+    looked at, sifted, encoded or written.
+
     Raises:
       UserError: the folder holds a data set of another config.
     """
-    console.require_positive(episodes=job.episodes, shard_size=job.shard_size, actions=job.actions, of=of)
-    console.require_between(1, MAX_ACTIONS, actions=job.actions)
-    console.require_seed(job.seed)
+    console.require_positive(of=of)
     console.require_out(out)
     if not 0 <= part < of:
         raise UserError(f"--shard {part} --of {of}: want 0 <= shard < of")
     job = dataclasses.replace(job, engine=resolve(job.engine))
     engine = make_engine(job.engine, timestep=job.timestep)
     _claim(job, out)
-    # the content of a shard does not depend on how many others there are
-    config = {key: value for key, value in job.describe().items() if key != "episodes"}
     mine = range(part, job.shards(), of)
     todo = [index for index in mine if not _written(out, index, job)]
     total = sum(map(job.size, mine))
     with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
-        for index in todo:
-            made, counts = shard(job, index, engine, progress)
-            records.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
-            records.update_manifest(out)
+        _write_all(job, todo, out, engine, _Tally(progress))
     manifest = records.update_manifest(out)
     console.say(f"{out}: {manifest['episodes']} {job.kind} episodes in {len(manifest['shards'])} shards")
+
+
+def _write_all(job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tally: _Tally) -> None:
+    """Make and write the shards `todo`, AT_ONCE at a time; the first error stops all."""
+    # the content of a shard does not depend on how many others there are
+    config = {key: value for key, value in job.describe().items() if key != "episodes"}
+
+    def one(index: int) -> None:
+        made, counts = shard(job, index, engine, tally)
+        records.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
+        records.update_manifest(out)
+
+    with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
+        futures = [pool.submit(one, index) for index in todo]
+        try:
+            for future in concurrent.futures.as_completed(futures):
+                future.result()
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            engine.stop()
+            raise
 
 
 def _written(out: pathlib.Path, index: int, job: Job) -> bool:

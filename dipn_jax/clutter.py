@@ -35,7 +35,7 @@ def settled(
     """
     made = _random_scenes(jax.random.split(key, BATCH), config)
     scene, poses = structs.take(made, slice(0, count))
-    rollout = primitives.settle(engine, scene, poses)
+    rollout = primitives.settle(engine, scene, poses, fence=primitives.FENCE_TIME)
     fault = np.asarray(rollout.fault)
     everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)
     counts = {f"settle_{name}": n for name, n in Fault.count(fault).items()}

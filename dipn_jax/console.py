@@ -47,13 +47,15 @@ class Progress:
                 rich.progress.TextColumn("{task.description}"),
                 rich.progress.BarColumn(),
                 rich.progress.MofNCompleteColumn(),
+                rich.progress.TextColumn("{task.fields[rate]}"),
                 rich.progress.TextColumn("{task.fields[note]}"),
                 rich.progress.TimeRemainingColumn(),
                 console=rich.console.Console(stderr=True),
             )
-            self._task = self._bar.add_task(title, total=total, completed=done, note="")
+            self._task = self._bar.add_task(title, total=total, completed=done, rate="", note="")
         self._begun = time.monotonic()
         self._logged = self._begun
+        self._lock = threading.Lock()
 
     def __enter__(self) -> Progress:
         if self._bar:
@@ -69,18 +71,22 @@ class Progress:
             self._line()
 
     def advance(self, amount: int, note: str = "") -> None:
-        """`amount` more are done; `note` is shown beside the count."""
-        self.done += amount
-        self.note = note
-        if self._bar:
-            self._bar.update(self._task, completed=self.done, note=note)
-        elif time.monotonic() - self._logged > LOG_PERIOD:
-            self._line()
+        """`amount` more are done; `note` is shown beside the count. Any thread may call."""
+        with self._lock:
+            self.done += amount
+            self.note = note
+            if self._bar:
+                rate = f"{self._rate():.1f} {self.unit}/s"
+                self._bar.update(self._task, completed=self.done, rate=rate, note=note)
+            elif time.monotonic() - self._logged > LOG_PERIOD:
+                self._line()
+
+    def _rate(self) -> float:
+        return (self.done - self.begun_at) / max(time.monotonic() - self._begun, 1e-9)
 
     def _line(self) -> None:
         self._logged = time.monotonic()
-        seconds = max(self._logged - self._begun, 1e-9)
-        rate = (self.done - self.begun_at) / seconds
+        rate = self._rate()
         left = (self.total - self.done) / rate if rate > 0 else float("inf")
         note = f", {self.note}" if self.note else ""
         print(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 import pathlib
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,16 +26,46 @@ MIN_SIDE = 0.025
 """Metres: no side is thinner. The fingertips stop 20 mm above the table, and 2.5 mm of pad cannot hold a box."""
 
 
+Range: TypeAlias = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranges:
+    """What random objects are drawn from, all uniformly."""
+
+    items: tuple[str, ...] = ()
+    """Names from the catalogue (`shapes.CATALOGUE`); none given: all of them."""
+    scale: Range = (0.9, 1.03)
+    """Of each nominal dimension; no side is made thinner than 25 mm."""
+    density: Range = (250.0, 750.0)
+    """kg/m^3."""
+    friction: Range = (0.28, 0.42)
+    """Sliding coefficient between object and table; between objects it is 0.5 / 0.35 of the larger of two."""
+    color_noise: float = 0.0
+    """Most by which each channel, in [0, 1], differs from a colour of the palette."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in (("scale", self.scale), ("density", self.density), ("friction", self.friction)):
+            if not 0 < low <= high < math.inf:
+                raise UserError(f"{name} {low:g} {high:g}: want two numbers above 0, the smaller one first")
+        if not 0 <= self.color_noise <= 1:
+            raise UserError(f"color noise {self.color_noise:g}: want 0 to 1")
+        names = [item.name for item in shapes.CATALOGUE]
+        unknown = [name for name in self.items if name not in names]
+        if unknown:
+            raise UserError(f"items {' '.join(unknown)}: not in the catalogue; choose from {' '.join(sorted(names))}")
+
+
+DEFAULT_RANGES = Ranges()
+
+
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
     """What random scenes are made of."""
 
     slots: int = 7  # padded number of objects
     counts: tuple[float, ...] = PAPER_COUNTS  # probability of 1, 2, ... objects
-    items: tuple[str, ...] = ()  # names from shapes.CATALOGUE; empty: all of them
-    scale: tuple[float, float] = (0.9, 1.03)  # of each nominal dimension
-    density: tuple[float, float] = (250.0, 750.0)  # kg/m^3
-    friction: tuple[float, float] = (0.28, 0.42)  # object-table
+    ranges: Ranges = DEFAULT_RANGES
     spread: float = 0.24  # metres: side of the square the objects' centres are dropped in
 
     def __post_init__(self) -> None:
@@ -44,10 +75,6 @@ class SceneConfig:
             )
         if min(self.counts) < 0 or sum(self.counts) <= 0:
             raise UserError(f"scene config: counts {self.counts} are not probabilities; want non-negative, sum > 0")
-        names = {item.name for item in shapes.CATALOGUE}
-        unknown = [name for name in self.items if name not in names]
-        if unknown:
-            raise UserError(f"scene config: unknown items {unknown}; choose from {sorted(names)}")
 
 
 def fixed_count(count: int, **changes: Any) -> SceneConfig:
@@ -55,14 +82,16 @@ def fixed_count(count: int, **changes: Any) -> SceneConfig:
     return SceneConfig(slots=count, counts=(0.0,) * (count - 1) + (1.0,), **changes)
 
 
-def parse_objects(text: str) -> SceneConfig:
+def parse_objects(text: str, *, ranges: Ranges = DEFAULT_RANGES) -> SceneConfig:
     """A config from a user's word: `10`, `1:7` (uniform) or `paper` (PAPER_COUNTS).
+
+    More than ten objects are dropped over a wider square, so that their tower is not too high to fall from.
 
     Raises:
       UserError: the text is none of these.
     """
     if text == "paper":
-        return SceneConfig()
+        return SceneConfig(ranges=ranges)
     low, _, high = text.partition(":")
     try:
         first, last = int(low), int(high or low)
@@ -71,7 +100,7 @@ def parse_objects(text: str) -> SceneConfig:
     if not 1 <= first <= last <= 30:
         raise UserError(f"--objects {text}: want 1 to 30, smaller number first")
     counts = (0.0,) * (first - 1) + (1.0 / (last - first + 1),) * (last - first + 1)
-    return SceneConfig(slots=last, counts=counts)
+    return SceneConfig(slots=last, counts=counts, ranges=ranges, spread=0.24 if last <= 10 else 0.30)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -86,25 +115,26 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
       The scene, and poses `[N, 7]`: random positions and orientations, each object just above the
       bounding spheres of those before it. Empty slots are parked outside the workspace.
     """
-    n = config.slots
+    n, ranges = config.slots, config.ranges
     keys = jax.random.split(key, 9)
-    items = [i for i in shapes.CATALOGUE if not config.items or i.name in config.items]
+    items = [i for i in shapes.CATALOGUE if not ranges.items or i.name in ranges.items]
     classes = jnp.array([shapes.CLASSES.index(i.shape) for i in items])
     nominal = jnp.array([i.size_mm for i in items], jnp.float32) / 1000
     count = 1 + jax.random.categorical(keys[0], jnp.log(jnp.array(config.counts)))
     present = jnp.arange(n) < count
     item = jax.random.randint(keys[1], (n,), 0, len(items))
     shape = jnp.where(present, classes[item], ABSENT)
-    size = nominal[item] * jax.random.uniform(keys[2], (n, 3), minval=config.scale[0], maxval=config.scale[1])
+    size = nominal[item] * jax.random.uniform(keys[2], (n, 3), minval=ranges.scale[0], maxval=ranges.scale[1])
     size = jnp.maximum(size, MIN_SIDE)
     diagonal = jnp.linalg.norm(size, axis=-1, keepdims=True)
     size = size * jnp.minimum(1.0, shapes.MAX_DIAGONAL / diagonal)
     colors = jnp.array(shapes.COLORS_RGB, jnp.float32) / 255
     palette = jax.random.permutation(keys[3], len(colors))
-    color = colors[palette[jnp.arange(n) % len(colors)]]
-    density = jax.random.uniform(keys[4], (n,), minval=config.density[0], maxval=config.density[1])
+    noise = ranges.color_noise * jax.random.uniform(keys[8], (n, 3), minval=-1.0)
+    color = jnp.clip(colors[palette[jnp.arange(n) % len(colors)]] + noise, 0.0, 1.0)
+    density = jax.random.uniform(keys[4], (n,), minval=ranges.density[0], maxval=ranges.density[1])
     mass = density * jnp.asarray(shapes.UNIT_VOLUME, jnp.float32)[classes[item]] * size.prod(-1)
-    friction = jax.random.uniform(keys[5], (n,), minval=config.friction[0], maxval=config.friction[1])
+    friction = jax.random.uniform(keys[5], (n,), minval=ranges.friction[0], maxval=ranges.friction[1])
     xy = jax.random.uniform(keys[6], (n, 2), minval=-0.5, maxval=0.5) * config.spread
     quat = geometry.random_quat(keys[7], shape=(n,))
     radius = shapes.radius(shape, size)

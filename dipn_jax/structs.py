@@ -130,7 +130,7 @@ class PushEpisode(Pytree):
     """One push: everything needed to render it, before, during and after."""
 
     scene: Scene
-    poses: Array  # [11, N, 7]: at 0, 1, ..., 10 cm of travel
+    poses: Array  # [11, N, 7]: at 0, 1, ..., 10 cm of travel; past `push.distance`, as often (every 0.1 s)
     after: Array  # [N, 7]: at rest, the gripper gone
     push: Push
     fault: Array  # [] int32

@@ -136,7 +136,7 @@ def clear(
     settings = dict(locals())
     _check(out, seed, instances=instances, candidates=candidates)
     console.require_between(1, MAX_CANDIDATES, candidates=candidates)
-    console.require_between(0.01, 0.12, distance=distance)
+    console.require_between(0.01, 0.10, distance=distance)
     console.require_between(0.0, 10.0, gamma=gamma, threshold=threshold)
     physics = make_engine(engine)
     config = clearing.ClearConfig(method, candidates, distance, gamma, threshold)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pathlib
 from typing import Any
 
+import dipn_jax  # noqa: F401  isort: skip  settings that must be made before JAX is imported
+
 import jax
 import numpy as np
 import pytest

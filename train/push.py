@@ -48,6 +48,11 @@ class PushTask:
         self.fingerprint = f"{fingerprint}:{count}:{centimetres}"
         self.centimetres = np.array(centimetres, np.int32)
         self.slots = episodes.scene.shape.shape[1]
+        shortest = 100 * float(np.min(episodes.push.distance))
+        if min(centimetres) > shortest + 0.01:
+            raise UserError(
+                f"--centimetres {centimetres}: {data} has pushes of {shortest:.0f} cm; give as low a number"
+            )
 
     def fetch(self, index: np.ndarray) -> PushEpisode:
         """See `loop.Task`."""
@@ -63,7 +68,8 @@ class PushTask:
         """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored."""
         count = batch.fault.shape[0]
         distance_key, mirror_key = jax.random.split(key)
-        chosen = jnp.asarray(self.centimetres)[jax.random.randint(distance_key, (count,), 0, len(self.centimetres))]
+        weight = jnp.log(self._recorded(batch).astype(jnp.float32))
+        chosen = jnp.asarray(self.centimetres)[jax.random.categorical(distance_key, weight)]
         inputs, target = self.prepare(batch, chosen)
         flipped = jax.random.bernoulli(mirror_key, 0.5, (count,))
 
@@ -73,6 +79,10 @@ class PushTask:
         inputs = jax.tree.map(pick, dipn.mirror(inputs), inputs)
         target = pick(target * jnp.array([1.0, -1.0, -1.0]), target)
         return losses.motion_loss(model(inputs), target, inputs.present)
+
+    def _recorded(self, episodes: PushEpisode) -> jax.Array:
+        """Which of the distances learnt the pushes `[B]` reach: `[B, centimetres]` bool."""
+        return jnp.asarray(self.centimetres[None] * 0.01) <= jnp.asarray(episodes.push.distance)[:, None] + 1e-4
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss, and position error of moved objects (mm), at the largest distance."""
@@ -91,7 +101,7 @@ class PushTask:
     @functools.partial(jax.jit, static_argnums=(0, 1))
     def _measure(self, graph: Any, state: Any, episodes: PushEpisode, weight: jax.Array) -> tuple[jax.Array, ...]:
         model = nnx.merge(graph, state)
-        distance = jnp.full(weight.shape, int(self.centimetres.max()))
+        distance = jnp.where(self._recorded(episodes), self.centimetres, 0).max(-1)
         inputs, target = self.prepare(episodes, distance)
         predicted = model(inputs)
         counted = inputs.present & weight[:, None]

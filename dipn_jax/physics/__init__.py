@@ -7,9 +7,11 @@ one runs is a configuration value.
 from __future__ import annotations
 
 import dataclasses
+from types import ModuleType
 from typing import Literal, Protocol
 
 import jax
+import jax.numpy as jnp
 
 from dipn_jax.errors import UserError
 from dipn_jax.model import PhysicsConfig
@@ -19,14 +21,27 @@ EngineName = Literal["auto", "native", "mjx"]
 
 CONTROL_PERIOD = 0.01
 """Seconds between set points; faults are looked for as often."""
-MAX_SPEED = 5.0
-"""m/s; a drop from 0.6 m ends at 3.4 m/s."""
-REST_SPEED = 0.02
-"""m/s (and, times the size of an object, the bound on rotation) below which a scene is at rest."""
-MAX_SINK = 0.004
-"""Metres that the lowest corner of an object may be under the table."""
-MAX_SHORT = 0.01
-"""Metres by which a gripper may miss its last set point."""
+FENCE = 0.17
+"""Metres from the workspace's centre along x or y beyond which a fence pushes centres of mass back."""
+FENCE_RATE = 30.0
+"""rad/s of the fence's critically damped spring (per mass): 11 mm beyond it, the push is an object's weight."""
+
+
+def fence_force(mass: Array, position: Array, velocity: Array, *, xp: ModuleType = jnp) -> Array:
+    """What a fence does to objects: it has no surface, so any number of them costs no contact.
+
+    Args:
+      mass: `[..., N]` kg.
+      position: `[..., N, 2]` metres, workspace: centres of mass.
+      velocity: `[..., N, 2]` m/s.
+      xp: numpy or jax.numpy.
+
+    Returns:
+      Forces `[..., N, 2]` in newtons: zero within FENCE, a damped spring beyond.
+    """
+    beyond = position - xp.clip(position, -FENCE, FENCE)
+    pull = -(FENCE_RATE**2) * beyond - 2 * FENCE_RATE * velocity
+    return mass[..., None] * xp.where(beyond == 0, 0.0, pull)
 
 
 def substeps(config: PhysicsConfig) -> int:
@@ -42,13 +57,20 @@ def substeps(config: PhysicsConfig) -> int:
 
 
 class Engine(Protocol):
-    """Simulates a batch of independent scenes."""
+    """Simulates batches of independent scenes. Threads may share one: it steps one batch at a time."""
 
     name: str
     config: PhysicsConfig
 
     def simulate(
-        self, scenes: Scene, poses: Array, trajectories: Trajectory, samples: Array, *, settle: bool = False
+        self,
+        scenes: Scene,
+        poses: Array,
+        trajectories: Trajectory,
+        samples: Array,
+        *,
+        settle: bool = False,
+        fence: float = 0.0,
     ) -> Rollout:
         """Follow `trajectories` from rest.
 
@@ -58,11 +80,23 @@ class Engine(Protocol):
           trajectories: `time [B, K]`, `target [B, K, 5]`; the gripper starts at the first key frame.
           samples: `[S]` seconds, increasing, common to the batch; the simulation ends at the last.
           settle: flag episodes in which something still moves at the end.
+          fence: seconds from the start for which objects are kept near the workspace's centre (`fence_force`).
 
         Returns:
           Rollout with a leading `[B]`; what went wrong is in `fault [B]`.
+
+        Raises:
+          Stopped: `stop` was called.
         """
         ...
+
+    def stop(self) -> None:
+        """From another thread: end `simulate`, now and from now on, as soon as can be."""
+        ...
+
+
+class Stopped(Exception):
+    """An engine was told to stop."""
 
 
 def resolve(name: EngineName) -> EngineName:

@@ -10,10 +10,10 @@ Newton solver, so `DEFAULTS` has the pyramidal one.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -24,10 +24,11 @@ from mujoco.mjx._src.types import GeomType
 
 from dipn_jax import model, physics, shapes
 from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
-from dipn_jax.physics import prisms
+from dipn_jax.physics import faults, prisms, recording
+from dipn_jax.physics.recording import Record, State
 from dipn_jax.scenes import parked
-from dipn_jax.structs import Array, Fault, Pytree, Rollout, Scene, Trajectory
-from dipn_jax.workspace import GRIPPER, WORKSPACE
+from dipn_jax.structs import Array, Rollout, Scene, Trajectory
+from dipn_jax.workspace import GRIPPER
 
 DEFAULTS = PhysicsConfig(
     timestep=0.01 / 3,  # at 0.005 a squeezed object trembles, and a thin hold of 5 mm slips out
@@ -42,37 +43,20 @@ SAMPLES = 12
 """Sampled instants are padded likewise."""
 
 
-@flax.struct.dataclass
-class _State(Pytree):
-    """What passes from one substep to the next."""
-
-    qpos: jax.Array  # [6 + 7 N]
-    qvel: jax.Array  # [6 + 6 N]
-    warmstart: jax.Array  # [6 + 6 N]
-    full: jax.Array  # [] bool: contacts or geom pairs were left out
-
-
-@flax.struct.dataclass
-class _Record(Pytree):
-    """What is kept of a rollout; leading `[B]`."""
-
-    poses: jax.Array  # [S, N, 7]
-    gripper: jax.Array  # [S, 5]
-    top: jax.Array  # [] m/s: highest speed of a present object
-    broken: jax.Array  # [] bool
-
-
 class MjxEngine:
     """See `physics.Engine`."""
 
     name = "mjx"
 
-    def __init__(self, config: PhysicsConfig = DEFAULTS, *, chunk: int = 256) -> None:
+    def __init__(
+        self, config: PhysicsConfig = DEFAULTS, *, chunk: int = 256, devices: Sequence[jax.Device] | None = None
+    ) -> None:
         """An engine that compiles when it first meets a layout.
 
         Args:
           config: solver settings; the control period must be a whole number of time steps.
-          chunk: most scenes simulated at once.
+          chunk: most scenes simulated at once, whatever is asked for: it bounds the memory. A power of two.
+          devices: share every chunk; all local ones if not given. A power of two of them are used.
 
         Raises:
           UserError: the control period is not a whole number of time steps.
@@ -80,29 +64,63 @@ class MjxEngine:
         self.substeps = physics.substeps(config)
         prisms.register()
         self.config, self.chunk = config, chunk
+        local = list(devices or jax.local_devices())
+        self.devices = local[: 1 << (len(local).bit_length() - 1)]
         self.programs: dict[int, Callable[..., Rollout]] = {}  # by number of slots
+        self._stopped, self._lock = threading.Event(), threading.Lock()
 
     def simulate(
-        self, scenes: Scene, poses: Array, trajectories: Trajectory, samples: Array, *, settle: bool = False
+        self,
+        scenes: Scene,
+        poses: Array,
+        trajectories: Trajectory,
+        samples: Array,
+        *,
+        settle: bool = False,
+        fence: float = 0.0,
     ) -> Rollout:
         """See `physics.Engine.simulate`; numpy arrays out."""
         ticks = np.round(np.asarray(samples) / physics.CONTROL_PERIOD).astype(np.int32)
         padded = np.append(ticks, np.full(max(SAMPLES - len(ticks), 0), -1, np.int32))
         args = jax.tree.map(np.asarray, (scenes, poses, _pad(trajectories)))
         batch, slots = args[0].shape.shape
-        if slots not in self.programs:
-            with jax.numpy_rank_promotion("allow"):
-                self.programs[slots] = jax.jit(_Program(self.config, slots, self.substeps).run)
         # powers of two, so that batches of many sizes share few programs
-        size = min(1 << (batch - 1).bit_length(), self.chunk)
+        size = max(min(1 << (batch - 1).bit_length(), self.chunk), len(self.devices))
         done = []
-        for start in range(0, batch, size):
-            rows = np.minimum(np.arange(start, start + size), batch - 1)
-            part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)
-            with jax.numpy_rank_promotion("allow"):  # MJX relies on it
-                done.append(self.programs[slots](*part, padded, np.bool_(settle)))
+        with self._lock, jax.numpy_rank_promotion("allow"):  # MJX relies on it
+            for start in range(0, batch, size):
+                rows = np.minimum(np.arange(start, start + size), batch - 1)
+                part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)
+                if self._stopped.is_set():
+                    raise physics.Stopped
+                room = _room(size, len(padded), slots)
+                done.append(self._program(slots)(*part, room, padded, np.bool_(settle), np.float32(fence)))
         out = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(x) for x in leaves])[:batch], *done)
         return Rollout(out.poses[:, : len(ticks)], out.gripper[:, : len(ticks)], out.fault)
+
+    def _program(self, slots: int) -> Callable[..., Rollout]:
+        """The compiled function for scenes of `slots` objects: each device runs its share of a batch by itself."""
+        if slots not in self.programs:
+            mesh = jax.sharding.Mesh(np.array(self.devices), ("batch",))
+            split, whole = jax.sharding.PartitionSpec("batch"), jax.sharding.PartitionSpec()
+            run = jax.shard_map(
+                _Program(self.config, slots, self.substeps).run,
+                mesh=mesh,
+                in_specs=(split, split, split, split, whole, whole, whole),
+                out_specs=split,
+                check_vma=False,  # MJX starts its loops from constants, which that check refuses
+            )
+            self.programs[slots] = jax.jit(run, donate_argnums=3)
+        return self.programs[slots]
+
+    def stop(self) -> None:
+        """See `physics.Engine.stop`: at the end of the chunk at hand."""
+        self._stopped.set()
+
+
+def _room(batch: int, samples: int, slots: int) -> tuple[Array, Array]:
+    """Memory for poses and gripper of a record, which the result takes over."""
+    return np.zeros((batch, samples, slots, 7), np.float32), np.zeros((batch, samples, 5), np.float32)
 
 
 def _pad(trajectories: Trajectory) -> Trajectory:
@@ -140,40 +158,55 @@ class _Program:
         ]
 
     def run(
-        self, scenes: Scene, poses: jax.Array, trajectories: Trajectory, ticks: jax.Array, settle: jax.Array
+        self,
+        scenes: Scene,
+        poses: jax.Array,
+        trajectories: Trajectory,
+        room: tuple[jax.Array, jax.Array],
+        ticks: jax.Array,
+        settle: jax.Array,
+        fence: jax.Array,
     ) -> Rollout:
-        """`MjxEngine.simulate` with padded key frames `[B, 8]` and sampled control ticks `[12]` (-1: none)."""
+        """`MjxEngine.simulate` with padded key frames `[B, 8]`, room for a record, control ticks `[12]` (-1: none)."""
         present = scenes.shape >= 0
         fields = jax.vmap(self._fields)(scenes)
         start = jnp.where(present[..., None], poses, parked(self.slots))
-        target = functools.partial(_control, trajectories)
+        mass = jnp.where(present, scenes.mass, 0.0)
+        target = functools.partial(recording.control, trajectories)
         state = jax.vmap(self._initial)(start, target(0.0))
-        record = _Record(
-            jnp.zeros((len(poses), len(ticks), *poses.shape[1:])),
-            jnp.zeros((len(poses), len(ticks), 5)),
-            jnp.zeros(len(poses)),
-            jnp.zeros(len(poses), bool),
-        )
+        record = Record(*room, jnp.zeros(len(poses)), jnp.zeros(len(poses), bool))
 
-        def body(tick: jax.Array, carry: tuple[_State, _Record]) -> tuple[_State, _Record]:
+        def body(tick: jax.Array, carry: tuple[State, Record]) -> tuple[State, Record]:
             state, record = carry
-            record = _store(record, state, ticks == tick)
+            record = recording.store(record, state, ticks == tick)
             ctrl = target(tick * physics.CONTROL_PERIOD + GRIPPER.lag)
-            state = jax.vmap(self._tick)(fields, state, ctrl)
-            return state, _watch(record, state, present)
+            force = jnp.where(tick * physics.CONTROL_PERIOD < fence, recording.hold_in(mass, state), 0.0)
+            state = jax.vmap(self._tick)(fields, state, ctrl, force)
+            return state, recording.watch(record, state, scenes)
 
         last = ticks.max()
         state, record = jax.lax.fori_loop(0, last, body, (state, record))
-        record = _store(record, state, ticks == last)
+        record = recording.store(record, state, ticks == last)
         end = target(last * physics.CONTROL_PERIOD)
-        fault = _faults(scenes, state, record, end, settle)
+        fault = faults.codes(
+            scenes,
+            state.qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7),
+            recording.velocity(state, scenes),
+            state.qpos[:, :3],
+            end[:, :3],
+            top=record.top,
+            broken=record.broken,
+            full=state.full,
+            depth=state.depth,
+            settle=settle,
+        )
         kept = jnp.where(present[:, None, :, None], record.poses, poses[:, None])
         return Rollout(kept, record.gripper, fault)
 
-    def _initial(self, poses: jax.Array, ctrl: jax.Array) -> _State:
+    def _initial(self, poses: jax.Array, ctrl: jax.Array) -> State:
         rest = jnp.zeros(self.base.nv, jnp.float32)
         qpos = jnp.concatenate([ctrl, poses.reshape(-1)]).astype(jnp.float32)
-        return _State(qpos, rest, rest, jnp.zeros((), bool))
+        return State(qpos, rest, rest, jnp.zeros((), bool), jnp.zeros((), jnp.float32))
 
     def _fields(self, scene: Scene) -> dict[str, Any]:
         """The leaves of the model that depend on one scene."""
@@ -206,15 +239,16 @@ class _Program:
         """Rows for the geoms that are no part of an object in front of `leaf [3 N, ...]`."""
         return jnp.concatenate([jnp.zeros((self.first_geom, *leaf.shape[1:]), leaf.dtype), leaf])
 
-    def _tick(self, fields: dict[str, Any], state: _State, ctrl: jax.Array) -> _State:
+    def _tick(self, fields: dict[str, Any], state: State, ctrl: jax.Array, force: jax.Array) -> State:
         """One control period of one scene."""
         m = self.base.tree_replace(fields)
 
-        def substep(state: _State, _: None) -> tuple[_State, None]:
-            d = self.data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
-            d = mjx.step(m, d)
+        def substep(state: State, _: None) -> tuple[State, None]:
+            d = self.data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)
+            d = mjx.step(m, d.replace(ctrl=ctrl, qfrc_applied=force))
             full = state.full | self._saturated(m, d)
-            return jax.tree.map(_strong, _State(d.qpos, d.qvel, d.qacc_warmstart, full), state), None
+            depth = jnp.maximum(0.0, -d._impl.contact.dist.min())
+            return jax.tree.map(_strong, State(d.qpos, d.qvel, d.qacc_warmstart, full, depth), state), None
 
         return jax.lax.scan(substep, state, None, length=self.substeps)[0]
 
@@ -237,56 +271,3 @@ class _Program:
 def _strong(new: jax.Array, old: jax.Array) -> jax.Array:
     """`new` with the type of `old`: MJX returns weak types, which a loop does not take."""
     return jnp.asarray(new).astype(old.dtype)
-
-
-def _control(trajectories: Trajectory, time: Array | float) -> jax.Array:
-    """Actuator set points `[B, 6]` at `time`: linear between key frames, gap split over both fingers."""
-
-    def one(times: jax.Array, targets: jax.Array) -> jax.Array:
-        index = jnp.clip((times <= time).sum() - 1, 0, len(times) - 2)
-        span = jnp.maximum(times[index + 1] - times[index], 1e-9)
-        weight = jnp.clip((time - times[index]) / span, 0.0, 1.0)
-        pose = targets[index] * (1 - weight) + targets[index + 1] * weight
-        return jnp.concatenate([pose[:4], pose[4:] / 2, pose[4:] / 2])
-
-    return jax.vmap(one)(trajectories.time, trajectories.target)
-
-
-def _store(record: _Record, state: _State, now: jax.Array) -> _Record:
-    """Keep the present state in the samples `now [S]`."""
-    gripper, poses = state.qpos[:, :GRIPPER_DOF], state.qpos[:, GRIPPER_DOF:]
-    gripper = jnp.concatenate([gripper[:, :4], gripper[:, 4:].sum(-1, keepdims=True)], -1)
-    poses = poses.reshape(record.poses.shape[:1] + record.poses.shape[2:])
-    return record.replace(
-        poses=jnp.where(now[None, :, None, None], poses[:, None], record.poses),
-        gripper=jnp.where(now[None, :, None], gripper[:, None], record.gripper),
-    )
-
-
-def _watch(record: _Record, state: _State, present: jax.Array) -> _Record:
-    velocity = state.qvel[:, GRIPPER_DOF:].reshape(*present.shape, 6)
-    linear = jnp.where(present, jnp.linalg.norm(velocity[..., :3], axis=-1), 0.0).max(-1)
-    finite = jnp.isfinite(state.qpos).all(-1) & jnp.isfinite(state.qvel).all(-1)
-    top = jnp.maximum(record.top, jnp.where(finite, linear, 0.0))
-    return record.replace(top=top, broken=record.broken | ~finite)
-
-
-def _faults(scenes: Scene, state: _State, record: _Record, end: jax.Array, settle: jax.Array) -> jax.Array:
-    """Fault codes `[B]`, as the native engine has them."""
-    present = scenes.shape >= 0
-    velocity = state.qvel[:, GRIPPER_DOF:].reshape(*present.shape, 6)
-    linear, angular = (jnp.linalg.norm(v, axis=-1) for v in (velocity[..., :3], velocity[..., 3:]))
-    speed = jnp.maximum(linear, angular * jnp.linalg.norm(scenes.size, axis=-1) / 2)
-    position = state.qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7)
-    outside = (jnp.abs(position[..., :2]) > WORKSPACE.half).any(-1)
-    lowest = shapes.lowest_corner(scenes.shape, scenes.size, position)
-    flags = (
-        (Fault.NON_FINITE, record.broken),
-        (Fault.CAPACITY, state.full),
-        (Fault.UNSETTLED, settle & (present & (speed > physics.REST_SPEED)).any(-1)),
-        (Fault.OUTSIDE, (present & outside).any(-1)),
-        (Fault.SPEED, record.top > physics.MAX_SPEED),
-        (Fault.PENETRATION, (present & (lowest < -physics.MAX_SINK)).any(-1)),
-        (Fault.SHORT, jnp.abs(state.qpos[:, :3] - end[:, :3]).max(-1) > physics.MAX_SHORT),
-    )
-    return sum((jnp.where(where, bit, 0) for bit, where in flags), jnp.zeros(len(present), jnp.int32))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from datagen.generate import Job, generate
-from dipn_jax import records, scenes
+from dipn_jax import records, scenes, structs
 from dipn_jax.errors import UserError
 
 JOB = Job("push", scenes.fixed_count(3, spread=0.2), 24, 0, 16, 4, "native", None)
@@ -52,24 +52,26 @@ def test_a_gap_is_filled_with_the_same_bytes_and_the_rest_left_alone(copy: pathl
     assert records.verify(copy) == []
 
 
-def test_an_interruption_loses_at_most_the_shard_at_hand(
+def test_an_interruption_loses_at_most_the_shards_at_hand(
     copy: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "new"
     original = records.write_shard
+    job = dataclasses.replace(JOB, episodes=33)
 
-    def die_at_second(folder: pathlib.Path, index: int, *args: object, **options: object) -> None:
-        if index == 1:
+    def die_at_third(folder: pathlib.Path, index: int, *args: object, **options: object) -> None:
+        if index == 2:
             raise KeyboardInterrupt
         original(folder, index, *args, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(records, "write_shard", die_at_second)
+    monkeypatch.setattr(records, "write_shard", die_at_third)
     with pytest.raises(KeyboardInterrupt):
-        generate(JOB, out)
+        generate(job, out)
     monkeypatch.undo()
-    assert records.verify(out) == []
-    generate(JOB, out)
-    for index in (0, 1):
+    assert records.verify(out) == [] and list(out.glob("*.parquet"))
+    generate(job, out)
+    assert records.verify(out) == [] and len(records.load(out, kind="push")[0].fault) == 33
+    for index in (0,):  # the second is longer here
         assert records.shard_path(out, index).read_bytes() == records.shard_path(copy, index).read_bytes()
 
 
@@ -93,10 +95,24 @@ def test_a_shard_does_not_depend_on_how_many_others_there_are(copy: pathlib.Path
     assert records.shard_path(tmp_path / "short", 0).read_bytes() == records.shard_path(copy, 0).read_bytes()
 
 
+def test_every_distance_is_a_push_of_its_own_from_the_same_scene(tmp_path: pathlib.Path) -> None:
+    generate(dataclasses.replace(JOB, episodes=12, distances=(0.03, 0.1)), tmp_path / "sweep")
+    episodes, _ = records.load(tmp_path / "sweep", kind="push")
+    short, long = (structs.take(episodes, slice(i, None, 2)) for i in (0, 1))
+    np.testing.assert_allclose(short.push.distance, 0.03, atol=1e-6)
+    np.testing.assert_allclose(long.push.distance, 0.1, atol=1e-6)
+    np.testing.assert_allclose(short.poses[:, :3], long.poses[:, :3], atol=1e-6)
+    shift = [np.linalg.norm(part.after[..., :2] - part.poses[:, 0, :, :2], axis=-1).max(-1) for part in (short, long)]
+    assert (shift[0] < shift[1])[shift[1] > 0.04].all() and (shift[1] > 0.04).any()
+
+
 def test_nonsense_is_refused(tmp_path: pathlib.Path) -> None:
     for change in ({"episodes": -1}, {"shard_size": 0}, {"actions": 0}):
         with pytest.raises(UserError, match="want a number above 0"):
-            generate(dataclasses.replace(JOB, **change), tmp_path / "x")
+            dataclasses.replace(JOB, **change)
+    for distances in ((), (0.2,), (0.05, float("nan"))):
+        with pytest.raises(UserError, match="--distances"):
+            dataclasses.replace(JOB, distances=distances)
     for timestep in (-0.002, 0.004, 0.0):
         with pytest.raises(UserError, match="timestep"):
             generate(dataclasses.replace(JOB, timestep=timestep), tmp_path / "x")

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
 from typing import Any
 
 import jax
@@ -40,6 +44,22 @@ LINES = (
     ("half_cylinder", "cuboid", "triangular_prism"),
     ("triangular_prism", "cylinder", None),
 )
+
+
+DEVICES = """
+import jax, numpy as np
+from dipn_jax import console, primitives, scenes
+from dipn_jax.physics.mjx import MjxEngine
+console.enable_compilation_cache()
+assert jax.device_count() == 4
+keys, config = jax.random.split(jax.random.key(0), 8), scenes.fixed_count(1)
+scene, poses = jax.tree.map(np.asarray, jax.vmap(lambda key: scenes.random_scene(key, config=config))(keys))
+many, one = MjxEngine(), MjxEngine(devices=jax.devices()[:1])
+found, wanted = (primitives.settle(e, scene, poses, duration=0.1, fence=0.1) for e in (many, one))
+np.testing.assert_allclose(found.poses, wanted.poses, atol=1e-6)
+np.testing.assert_array_equal(found.fault, wanted.fault)
+"""
+"""Run with four virtual devices: each simulates two of eight scenes of one object."""
 
 
 @pytest.fixture(scope="session")
@@ -141,6 +161,25 @@ def test_a_scene_does_not_depend_on_its_batch(engine: MjxEngine, settled: tuple[
     assert five.poses.shape == (5, 1, SLOTS, 7)
     np.testing.assert_allclose(five.poses[:4], four.poses[::-1], atol=1e-5)
     np.testing.assert_allclose(five.poses[4], four.poses[0], atol=1e-5)
+
+
+def test_a_fence_pushes_as_in_mujoco_c(
+    engine: MjxEngine, reference: NativeEngine, settled: tuple[Scene, np.ndarray]
+) -> None:
+    scene, poses = settled
+    far = np.where(scene.shape[..., None] >= 0, poses + np.array([0.2, 0, 0, 0, 0, 0, 0]), poses).astype(np.float32)
+    found = primitives.settle(engine, scene, far, duration=0.1, fence=0.05)
+    wanted = primitives.settle(reference, scene, far, duration=0.1, fence=0.05)
+    np.testing.assert_allclose(found.poses[..., :3], wanted.poses[..., :3], atol=POSITION_TOLERANCE)
+    assert np.abs(far - wanted.poses[:, 0])[..., 0].max() > 0.02
+
+
+def test_a_batch_is_shared_by_all_devices_with_equal_results(tmp_path: pathlib.Path) -> None:
+    script = tmp_path / "devices.py"
+    script.write_text(DEVICES)
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, script], env=os.environ | flags, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
 
 
 def test_a_timestep_that_does_not_divide_the_control_period_is_refused() -> None:

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import physics, primitives, scenes, shapes, structs
+from dipn_jax import clutter, physics, primitives, scenes, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import native
 from dipn_jax.structs import Fault, Grasp, Push, Scene
+from dipn_jax.workspace import WORKSPACE
 
 
 def one_of_each(slots: int = 2) -> tuple[Scene, np.ndarray]:
@@ -128,6 +129,31 @@ def test_empty_slots_keep_their_pose(engine: Any, resting: Any) -> None:
     scene, poses = resting
     rollout = primitives.settle(engine, scene, poses, duration=0.1)
     np.testing.assert_allclose(rollout.poses[:, 0, 1], poses[:, 1], atol=1e-6)
+
+
+def test_a_fence_keeps_objects_in_while_it_is_up(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    poses = poses.copy()
+    poses[:, 0, :2] = [0.21, -0.22]
+    free = primitives.settle(engine, scene, poses, duration=0.5)
+    held = primitives.settle(engine, scene, poses, duration=0.5, fence=0.4)
+    assert (np.abs(free.poses[:, 0, 0, :2]) > 0.2).all()
+    assert (np.abs(held.poses[:, 0, 0, :2]) < physics.FENCE + 0.005).all()
+    np.testing.assert_allclose(held.poses[:, 0, 1], poses[:, 1], atol=1e-6)
+
+
+def test_thirty_objects_settle_inside(engine: Any) -> None:
+    kept, counts = clutter.settled(jax.random.key(0), engine, scenes.parse_objects("30"), 4)
+    assert counts["dropped_scenes"] == 4 and len(kept.fault) >= 2
+    assert (np.abs(kept.poses[..., :2]) < WORKSPACE.half).all()
+
+
+def test_a_stopped_engine_stops(resting: Any) -> None:
+    scene, poses = resting
+    engine = native.NativeEngine()
+    engine.stop()
+    with pytest.raises(physics.Stopped):
+        primitives.settle(engine, scene, poses)
 
 
 def test_unknown_engine_is_refused() -> None:

@@ -96,5 +96,5 @@ def test_a_wrong_number_of_objects_is_named(text: str) -> None:
 def test_a_config_that_contradicts_itself_is_named() -> None:
     with pytest.raises(UserError, match="counts"):
         scenes.SceneConfig(slots=2, counts=(0.5, 0.3, 0.2))
-    with pytest.raises(UserError, match="unknown items"):
-        scenes.SceneConfig(items=("banana",))
+    with pytest.raises(UserError, match="not in the catalogue"):
+        scenes.Ranges(items=("banana",))

@@ -1,0 +1,81 @@
+"""What goes wrong in a simulation, judged alike for every engine."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import jax.numpy as jnp
+
+from dipn_jax import shapes
+from dipn_jax.structs import Array, Fault, Scene
+from dipn_jax.workspace import WORKSPACE
+
+MAX_SPEED = 5.0
+"""m/s; a drop from 1.2 m ends at 4.9 m/s."""
+REST_SPEED = 0.02
+"""m/s (and, times the size of an object, the bound on rotation) below which a scene is at rest."""
+MAX_SINK = 0.004
+"""Metres that the lowest corner of an object may be under the table, or an object inside another."""
+MAX_SHORT = 0.01
+"""Metres by which a gripper may miss its last set point."""
+
+
+def speeds(scenes: Scene, velocity: Array, *, xp: ModuleType = jnp) -> tuple[Array, Array]:
+    """Speeds `[B, N]` (m/s) of objects with `velocity [B, N, 6]`: of the centre, and of the fastest point.
+
+    Empty slots have none; a velocity that is not finite stays so.
+    """
+    present = scenes.shape >= 0
+    linear = xp.linalg.norm(velocity[..., :3], axis=-1)
+    radius = xp.linalg.norm(scenes.size, axis=-1) / 2
+    angular = xp.linalg.norm(velocity[..., 3:], axis=-1) * radius
+    return xp.where(present, linear, 0.0), xp.where(present, xp.maximum(linear, angular), 0.0)
+
+
+def codes(
+    scenes: Scene,
+    position: Array,
+    velocity: Array,
+    hand: Array,
+    target: Array,
+    *,
+    top: Array,
+    broken: Array,
+    full: Array,
+    depth: Array,
+    settle: Array | bool,
+    xp: ModuleType = jnp,
+) -> Array:
+    """Fault codes at the end of a rollout.
+
+    Args:
+      scenes: `[B, N]`.
+      position: `[B, N, 7]` poses, metres.
+      velocity: `[B, N, 6]` linear and angular.
+      hand: `[B, 3]` metres: where the hand is.
+      target: `[B, 3]` metres: where it should be.
+      top: `[B]` m/s: highest speed of a centre on the way.
+      broken: `[B]` bool: something was not finite on the way.
+      full: `[B]` bool: contacts, or pairs of geoms, were left out on the way.
+      depth: `[B]` metres: deepest contact now.
+      settle: whether everything has to be at rest.
+      xp: numpy or jax.numpy.
+
+    Returns:
+      `[B]` int32, bits of `Fault`.
+    """
+    present = scenes.shape >= 0
+    _, speed = speeds(scenes, velocity, xp=xp)
+    outside = (xp.abs(position[..., :2]) > WORKSPACE.half).any(-1) & present
+    sunk = (shapes.lowest_corner(scenes.shape, scenes.size, position, xp=xp) < -MAX_SINK) & present
+    finite = xp.isfinite(xp.where(present[..., None], position, 0.0)).all((1, 2))
+    flags = (
+        (Fault.NON_FINITE, broken | ~finite),
+        (Fault.CAPACITY, full),
+        (Fault.UNSETTLED, settle & (speed > REST_SPEED).any(-1)),
+        (Fault.OUTSIDE, outside.any(-1)),
+        (Fault.SPEED, top > MAX_SPEED),
+        (Fault.PENETRATION, sunk.any(-1) | (depth > MAX_SINK)),
+        (Fault.SHORT, xp.abs(hand - target).max(-1) > MAX_SHORT),
+    )
+    return sum((xp.where(where, bit, 0) for bit, where in flags), xp.zeros(len(present), xp.int32))

@@ -1,0 +1,78 @@
+"""Traced bookkeeping of a rollout: set points, the fence's forces, sampled poses, faults on the way."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from dipn_jax import physics
+from dipn_jax.model import GRIPPER_DOF
+from dipn_jax.physics import faults
+from dipn_jax.structs import Array, Pytree, Scene, Trajectory
+
+
+@flax.struct.dataclass
+class State(Pytree):
+    """What passes from one substep to the next."""
+
+    qpos: jax.Array  # [6 + 7 N]
+    qvel: jax.Array  # [6 + 6 N]
+    warmstart: jax.Array  # [6 + 6 N]
+    full: jax.Array  # [] bool: contacts or geom pairs were left out
+    depth: jax.Array  # [] metres: deepest contact
+
+
+@flax.struct.dataclass
+class Record(Pytree):
+    """What is kept of a rollout; leading `[B]`."""
+
+    poses: Array  # [S, N, 7]
+    gripper: Array  # [S, 5]
+    top: Array  # [] m/s: highest speed of a present object
+    broken: Array  # [] bool
+
+
+def hold_in(mass: jax.Array, state: State) -> jax.Array:
+    """Generalized forces `[B, 6 + 6 N]` of the fence on objects of `mass [B, N]`, zero for empty slots."""
+    position = state.qpos[:, GRIPPER_DOF:].reshape(*mass.shape, 7)[..., :2]
+    velocity = state.qvel[:, GRIPPER_DOF:].reshape(*mass.shape, 6)[..., :2]
+    force = jnp.zeros((*mass.shape, 6)).at[..., :2].set(physics.fence_force(mass, position, velocity))
+    return jnp.pad(force.reshape(len(mass), -1), ((0, 0), (GRIPPER_DOF, 0)))
+
+
+def control(trajectories: Trajectory, time: Array | float) -> jax.Array:
+    """Actuator set points `[B, 6]` at `time`: linear between key frames, gap split over both fingers."""
+
+    def one(times: jax.Array, targets: jax.Array) -> jax.Array:
+        index = jnp.clip((times <= time).sum() - 1, 0, len(times) - 2)
+        span = jnp.maximum(times[index + 1] - times[index], 1e-9)
+        weight = jnp.clip((time - times[index]) / span, 0.0, 1.0)
+        pose = targets[index] * (1 - weight) + targets[index + 1] * weight
+        return jnp.concatenate([pose[:4], pose[4:] / 2, pose[4:] / 2])
+
+    return jax.vmap(one)(trajectories.time, trajectories.target)
+
+
+def store(record: Record, state: State, now: jax.Array) -> Record:
+    """Keep the present state in the samples `now [S]`."""
+    gripper, poses = state.qpos[:, :GRIPPER_DOF], state.qpos[:, GRIPPER_DOF:]
+    gripper = jnp.concatenate([gripper[:, :4], gripper[:, 4:].sum(-1, keepdims=True)], -1)
+    poses = poses.reshape(record.poses.shape[:1] + record.poses.shape[2:])
+    return record.replace(
+        poses=jnp.where(now[None, :, None, None], poses[:, None], record.poses),
+        gripper=jnp.where(now[None, :, None], gripper[:, None], record.gripper),
+    )
+
+
+def velocity(state: State, scenes: Scene) -> jax.Array:
+    """Of the objects `[B, N, 6]`."""
+    return state.qvel[:, GRIPPER_DOF:].reshape(*scenes.shape.shape, 6)
+
+
+def watch(record: Record, state: State, scenes: Scene) -> Record:
+    """Note speeds, and whether everything is finite."""
+    linear, _ = faults.speeds(scenes, velocity(state, scenes))
+    finite = jnp.isfinite(state.qpos).all(-1) & jnp.isfinite(state.qvel).all(-1)
+    top = jnp.maximum(record.top, jnp.where(finite, linear.max(-1), 0.0))
+    return record.replace(top=top, broken=record.broken | ~finite)
