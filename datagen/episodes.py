@@ -61,7 +61,7 @@ def push_batch(
     if observation is None:
         return Batch(None, counts)
     n = len(items.fault)
-    pushes, feasible = _aim_pushes(jax.random.split(aim, clutter.BATCH), observation, actions, config.slots)
+    pushes, feasible = aim_pushes(jax.random.split(aim, clutter.BATCH), observation, actions, config.slots)
     keep = np.asarray(feasible)[:n].reshape(-1)
     pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:])[keep], pushes)
     counts["infeasible_pushes"] = int((~keep).sum())
@@ -77,7 +77,9 @@ def push_batch(
 
 
 @functools.partial(jax.jit, static_argnames=("actions", "slots"))
-def _aim_pushes(keys: jax.Array, observation: Observation, actions: int, slots: int) -> tuple[Push, jax.Array]:
+def aim_pushes(keys: jax.Array, observation: Observation, actions: int, slots: int) -> tuple[Push, jax.Array]:
+    """Random pushes `[B, actions]` of observations `[B]`, and which are feasible."""
+
     def one(args: tuple[jax.Array, Observation]) -> tuple[Push, jax.Array]:
         return candidates.sample_pushes(args[0], args[1], count=actions, slots=slots, distance=PUSH_STEPS * 0.01)
 
@@ -93,7 +95,7 @@ def grasp_batch(
     if observation is None:
         return Batch(None, counts)
     n = len(items.fault)
-    grasps = _aim_grasps(jax.random.split(aim, clutter.BATCH), observation, actions)
+    grasps = aim_grasps(jax.random.split(aim, clutter.BATCH), observation, actions)
     grasps = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:]), grasps)
     repeated = structs.take(items, np.repeat(np.arange(n), actions))
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
@@ -110,7 +112,8 @@ def grasp_batch(
 
 
 @functools.partial(jax.jit, static_argnames="actions")
-def _aim_grasps(keys: jax.Array, observation: Observation, actions: int) -> Grasp:
+def aim_grasps(keys: jax.Array, observation: Observation, actions: int) -> Grasp:
+    """Random grasps `[B, actions]` of the foreground of observations `[B]`."""
     return jax.lax.map(lambda args: candidates.random_grasps(args[0], args[1], count=actions), (keys, observation))
 
 

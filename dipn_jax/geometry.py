@@ -5,9 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from dipn_jax.structs import Array
 from dipn_jax.workspace import WORKSPACE
-
-Array = jax.Array
 
 
 def quat_to_matrix(quat: Array) -> Array:

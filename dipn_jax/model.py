@@ -105,7 +105,7 @@ def _object(scene: Scene, slot: int, generic: bool, inertia: np.ndarray) -> tupl
     return f'<body name="o{slot}"><freejoint name="o{slot}"/>{inertial}{"".join(geoms)}</body>', "".join(assets)
 
 
-def _inertias(scene: Scene) -> np.ndarray:
+def inertias(scene: Scene) -> np.ndarray:
     """Diagonal inertia `[N, 3]`; that of a harmless ball for empty slots."""
     spread = shapes.UNIT_VARIANCE[np.maximum(scene.shape, 0)] * np.asarray(scene.size, float) ** 2
     inertia = np.asarray(scene.mass, float)[:, None] * (spread.sum(-1, keepdims=True) - spread)
@@ -157,9 +157,9 @@ def mjcf(
     Returns:
       XML text. qpos is `[x, y, z, yaw, left, right, (position, quaternion) of every slot]`.
     """
-    inertias = _inertias(scene)
+    spin = inertias(scene)
     n = len(scene.shape)
-    parts = [_object(scene, i, generic, inertias[i]) for i in range(n)]
+    parts = [_object(scene, i, generic, spin[i]) for i in range(n)]
     pairs = []
     for i in range(n):
         mu = float(scene.friction[i]) if scene.shape[i] >= 0 else 1.0

@@ -173,7 +173,7 @@ class Hull(Pytree):
     alive: jax.Array  # [P] bool
 
 
-def hull(shape: jax.Array, size: jax.Array) -> Hull:
+def hull(shape: Array, size: Array) -> Hull:
     """The parts of an object.
 
     Args:

@@ -184,3 +184,18 @@ def concatenate(batches: list[Any]) -> Any:
 def take(episodes: Any, index: np.ndarray | slice | int) -> Any:
     """Episodes `index` of a batched struct, as numpy."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[index], episodes)
+
+
+def stack(items: list[Any]) -> Any:
+    """Structs of one kind, stacked along a new leading axis, as numpy."""
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *items)
+
+
+def cast(items: Any) -> Any:
+    """The same with every floating-point leaf as float32, as numpy."""
+
+    def one(leaf: Array) -> np.ndarray:
+        array = np.asarray(leaf)
+        return array.astype(np.float32) if array.dtype.kind == "f" else array
+
+    return jax.tree.map(one, items)

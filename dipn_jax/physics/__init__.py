@@ -1,6 +1,6 @@
-"""One interface, two engines: `native` (MuJoCo C on CPU threads) and `mjx` (XLA: GPU, TPU, CPU).
+"""One interface, three engines: `native` (MuJoCo C on CPU threads), `mjx` (XLA: GPU, TPU, CPU) and `warp` (NVIDIA).
 
-Both read the same MJCF (`dipn_jax.model`), take the same arguments and return the same result, so which
+All read the same MJCF (`dipn_jax.model`), take the same arguments and return the same result, so which
 one runs is a configuration value.
 """
 
@@ -17,7 +17,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.model import PhysicsConfig
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
-EngineName = Literal["auto", "native", "mjx"]
+EngineName = Literal["auto", "native", "mjx", "warp"]
 
 CONTROL_PERIOD = 0.01
 """Seconds between set points; faults are looked for as often."""
@@ -125,7 +125,11 @@ def make_engine(name: EngineName, *, timestep: float | None = None) -> Engine:
         from dipn_jax.physics import mjx
 
         return mjx.MjxEngine(_with_timestep(mjx.DEFAULTS, timestep))
-    raise UserError(f"engine {name!r}: want auto, native or mjx")
+    if name == "warp":
+        from dipn_jax.physics import warp
+
+        return warp.WarpEngine(_with_timestep(warp.DEFAULTS, timestep))
+    raise UserError(f"engine {name!r}: want auto, native, mjx or warp")
 
 
 def _with_timestep(config: PhysicsConfig, timestep: float | None) -> PhysicsConfig:

@@ -3,8 +3,7 @@
 Shapes, sizes, masses, friction, poses and trajectories are traced; only the number of scenes and of object
 slots is compiled in. So all primitives and all scenes of one layout share one program (see `prisms` for how).
 
-What differs from the native engine, by measurement: MJX's elliptic friction cone diverges in float32 with the
-Newton solver, so `DEFAULTS` has the pyramidal one.
+Friction cones are elliptic, as in the native engine, with a solver of ours (`cone`): MJX's own diverges in float32.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from mujoco.mjx._src.types import GeomType
 
 from dipn_jax import model, physics, shapes
 from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
-from dipn_jax.physics import faults, prisms, recording
+from dipn_jax.physics import cone, faults, prisms, recording
 from dipn_jax.physics.recording import Record, State
 from dipn_jax.scenes import parked
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
@@ -32,8 +31,6 @@ from dipn_jax.workspace import GRIPPER
 
 DEFAULTS = PhysicsConfig(
     timestep=0.01 / 3,  # at 0.005 a squeezed object trembles, and a thin hold of 5 mm slips out
-    iterations=50,  # with 20 and a tolerance of 1e-6, 1 drop in 16 (7 objects) popped and ended in NaN; none with these
-    cone="pyramidal",
     geom_pairs=32,  # measured: at most 26 overlapping bounding spheres (10 objects, a push)
     contact_points=80,  # measured: at most 54 contacts with 7 objects, 75 with 10
 )
@@ -63,6 +60,7 @@ class MjxEngine:
         """
         self.substeps = physics.substeps(config)
         prisms.register()
+        cone.register()
         self.config, self.chunk = config, chunk
         local = list(devices or jax.local_devices())
         self.devices = local[: 1 << (len(local).bit_length() - 1)]

@@ -1,0 +1,133 @@
+"""Single objects at rest on the table, and centred antipodal grasps of them: the easiest case there is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dipn_jax import candidates, geometry, primitives, scenes, shapes, structs
+from dipn_jax.physics import Engine
+from dipn_jax.structs import Fault, Grasp, Scene
+from dipn_jax.workspace import GRIPPER
+
+OFFSET = 0.01
+"""Metres by which a try is off centre at most, along either of the gripper's axes."""
+TURN = np.deg2rad(7.5)
+"""Radians by which it is turned at most."""
+WIDEST = GRIPPER.stroke - 2 * OFFSET - 0.002
+"""Metres between two faces of an object that fits between the fingers wherever a try is."""
+FLAT = 1e-3
+"""Metres: corners as far out as that belong to the same face."""
+LEAST_FACE = np.array([0.01, 0.004])
+"""Metres by which opposite faces overlap at least, seen along the closing axis: across, and above the tips."""
+ORIENTATIONS = np.array(
+    [[1, 0, 0, 0], [0, 1, 0, 0], [0.5**0.5, 0.5**0.5, 0, 0], [0.5**0.5, -(0.5**0.5), 0, 0],
+     [0.5**0.5, 0, 0.5**0.5, 0], [0.5**0.5, 0, -(0.5**0.5), 0]]
+)  # fmt: skip
+"""Every side of the bounding box once at the bottom, `[6, 4]` wxyz."""
+
+
+def alone(rng: np.random.Generator, item: shapes.Item, count: int) -> tuple[Scene, np.ndarray]:
+    """Scenes `[count, 1]` of one object each, of random size, mass, friction and side below, just above the table.
+
+    Returns:
+      Scenes and poses `[count, 1, 7]`.
+    """
+    ranges = scenes.DEFAULT_RANGES
+    shape = np.full((count, 1), shapes.CLASSES.index(item.shape), np.int32)
+    size = np.array(item.size_mm) / 1000 * rng.uniform(*ranges.scale, (count, 1, 3))
+    size = np.maximum(size, scenes.MIN_SIDE)
+    mass = rng.uniform(*ranges.density, (count, 1)) * shapes.volume(shape, size)
+    friction = rng.uniform(*ranges.friction, (count, 1))
+    yaw = np.asarray(geometry.quat_about_z(rng.uniform(-np.pi, np.pi, count)))
+    quat = np.asarray(geometry.quat_multiply(yaw, ORIENTATIONS[np.arange(count) % len(ORIENTATIONS)]))
+    poses = np.concatenate([np.zeros((count, 3)), quat], -1)[:, None]
+    poses[..., 2] = 0.002 - shapes.lowest_corner(shape, size, poses, xp=np)
+    scene = Scene(shape, size, np.full((count, 1, 3), 0.5), mass, friction)
+    return structs.cast(scene), poses.astype(np.float32)
+
+
+def _corners(shape: int, size: np.ndarray, pose: np.ndarray) -> list[np.ndarray]:
+    """Corners `[M, 3]` of each part of an object in the workspace."""
+    turn = np.asarray(geometry.quat_to_matrix(pose[3:]))
+    parts = shapes.UNIT_VERTICES[shape][shapes.CORNERS_USED[shape] > 0]
+    return [(part * size) @ turn.T + pose[:3] for part in parts]
+
+
+def _directions(shape: int, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Angles `[K]` of the upright faces' normals."""
+    hull = shapes.hull(shape, size)
+    normals = np.asarray(hull.normals)[np.asarray(hull.alive)].reshape(-1, 3)
+    normals = normals @ np.asarray(geometry.quat_to_matrix(pose[3:])).T
+    upright = (np.abs(normals[:, 2]) < 0.02) & (np.linalg.norm(normals, axis=-1) > 0.5)
+    return np.unique(np.arctan2(normals[upright, 1], normals[upright, 0]).round(3) % np.pi)
+
+
+def antipodal(shape: int, size: np.ndarray, pose: np.ndarray) -> Grasp | None:
+    """The narrowest grasp between two upright, opposite faces of one part; None where none is WIDEST or less.
+
+    Args:
+      shape: index into `shapes.CLASSES`.
+      size: `[3]` metres.
+      pose: `[7]` at rest.
+    """
+    parts = _corners(shape, size, pose)
+    tip = float(candidates.grasp_height(max(part[:, 2].max() for part in parts)))
+    found = []
+    for angle in _directions(shape, size, pose):
+        axis, side = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        low, high = (end([end(part[:, :2] @ axis) for part in parts]) for end in (min, max))
+        for part in parts:
+            along = part[:, :2] @ axis
+            seen = np.stack([part[:, :2] @ side, part[:, 2]], -1)
+            ends = [seen[high - along < FLAT], seen[along - low < FLAT]]
+            if high - low > WIDEST or not (len(ends[0]) and len(ends[1])):
+                continue
+            left, right = np.max([e.min(0) for e in ends], 0), np.min([e.max(0) for e in ends], 0)
+            left[1] = max(left[1], tip)
+            if (right - left > LEAST_FACE).all():
+                middle = axis * (low + high) / 2 + side * (left[0] + right[0]) / 2
+                found.append((round(high - low, 4), -np.prod(right - left), Grasp(middle, angle, tip)))
+    return min(found, key=lambda entry: entry[:2])[2] if found else None
+
+
+def share_held(engine: Engine, rng: np.random.Generator, item: shapes.Item, tries: int) -> tuple[float, int]:
+    """Share of centred antipodal grasps, off by up to OFFSET and TURN, that hold; and the number of tries.
+
+    Objects that lie so that they cannot be grasped are not tried; 0 tries where an item never can.
+    """
+    scene, poses = alone(rng, item, 4 * tries)
+    rest = primitives.settle(engine, scene, poses, duration=0.6)
+    poses = np.asarray(rest.poses)[:, -1]
+    planned = [
+        None if rest.fault[i] else antipodal(int(scene.shape[i, 0]), scene.size[i, 0], poses[i, 0])
+        for i in range(len(poses))
+    ]
+    index = np.array([i for i, grasp in enumerate(planned) if grasp is not None][:tries], int)
+    if not len(index):
+        return float("nan"), 0
+    grasps = structs.stack([planned[i] for i in index])
+    shift = rng.uniform(-OFFSET, OFFSET, (len(index), 2))
+    center = grasps.center + np.asarray(geometry.rotate2d(shift, grasps.angle))
+    angle = grasps.angle + rng.uniform(-TURN, TURN, len(index))
+    grasps = structs.cast(grasps.replace(center=center, angle=angle))
+    rollout, outcome = primitives.grasp(engine, structs.take(scene, index), poses[index], grasps)
+    sound = (np.asarray(rollout.fault) & Fault.UNUSABLE) == 0
+    return float(np.asarray(outcome.success)[sound].mean()), int(sound.sum())
+
+
+def share_of_wrong_held(engine: Engine, rng: np.random.Generator, tries: int) -> tuple[float, float]:
+    """Shares of grasps that hold though they must not: closing on the 100 mm side, and with a finger on top.
+
+    The object under the finger weighs 20 kg: it does not give way.
+    """
+    item = next(item for item in shapes.CATALOGUE if item.name == "cuboid_long")
+    scene, poses = alone(rng, item, tries)
+    poses[:, 0, 2] -= 0.002
+    poses[:, 0, 3:] = np.asarray(geometry.quat_about_z(np.linspace(0, 3, tries)))
+    along = Grasp(poses[:, 0, :2], np.linspace(0, 3, tries), np.full(tries, 0.02))
+    heavy = scene.replace(mass=np.full_like(scene.mass, 20.0))
+    axis = np.stack([-np.sin(along.angle), np.cos(along.angle)], -1)
+    beside = along.replace(center=along.center + 0.045 * axis, angle=along.angle + np.pi / 2)
+    _, wide = primitives.grasp(engine, scene, poses, structs.cast(along))
+    _, on_top = primitives.grasp(engine, heavy, poses, structs.cast(beside))
+    return float(np.asarray(wide.success).mean()), float(np.asarray(on_top.success).mean())

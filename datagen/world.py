@@ -1,0 +1,160 @@
+"""Is the world right? Figures of drops, pushes, grasps, the camera and the engines: `dipn-datagen check-world`."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from datagen import episodes, isolated
+from dipn_jax import clutter, geometry, primitives, render, scenes, shapes, structs
+from dipn_jax.physics import Engine, native
+from dipn_jax.structs import Fault, Grasp, Push, SettledScene
+from dipn_jax.workspace import PUSH_STEPS
+
+COUNTS = (1, 3, 7, 10, 20, 30)
+"""Numbers of objects that drops are counted for."""
+MOVED = 0.001
+"""Metres: what the reference moves by more during a push counts in the engines' agreement."""
+TIPPED = np.deg2rad(45)
+"""Radians by which an object's own axes tilt when it tips over or rolls."""
+ENGINES: dict[str, tuple[str, float | None]] = {
+    "native_1ms": ("native", 0.001),
+    "native_3.3ms": ("native", 0.01 / 3),
+    "native_5ms": ("native", 0.005),
+    "mjx": ("mjx", None),
+}
+"""What is held against `native` at its own 2 ms: engine and time step (None: its own)."""
+Metrics = dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """Settled scenes, and a push and a grasp for every one; leaves `[B, ...]`."""
+
+    items: SettledScene
+    pushes: Push
+    grasps: Grasp
+
+    def first(self, count: int) -> Trial:
+        """The first `count` of them."""
+        return Trial(*(structs.take(x, slice(0, count)) for x in (self.items, self.pushes, self.grasps)))
+
+
+def drops(engine: Engine, key: jax.Array, tries: int) -> Metrics:
+    """`drop/{objects}/kept` and `drop/{objects}/{fault}`: shares of random drops."""
+    found = {}
+    for count in COUNTS:
+        kept, counted = clutter.settled(key, engine, scenes.parse_objects(str(count)), tries)
+        found[f"drop/{count}/kept"] = len(kept.fault) / tries
+        for name, n in counted.items():
+            if name != "dropped_scenes":
+                found[f"drop/{count}/{name.removeprefix('settle_')}"] = n / tries
+    return found
+
+
+def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
+    """`grasp_isolated/{shape}`: share of `isolated.share_held`; and grasps that must not hold."""
+    found = {}
+    for item in shapes.CATALOGUE:
+        found[f"grasp_isolated/{item.name}"], count = isolated.share_held(
+            engine, np.random.default_rng(seed), item, tries
+        )
+        found[f"grasp_isolated_tries/{item.name}"] = count
+    found["grasp_too_wide/held"], found["grasp_on_top/held"] = isolated.share_of_wrong_held(
+        engine, np.random.default_rng(seed), tries
+    )
+    return found
+
+
+def trial(engine: Engine, key: jax.Array, count: int) -> Trial:
+    """`count` scenes of 1 to 7 objects, with a random feasible push and a random grasp of the foreground."""
+    drop, aim = jax.random.split(key)
+    items = clutter.settled_exactly(drop, engine, scenes.SceneConfig(), 2 * count)
+    whole = structs.take(items, np.arange(clutter.BATCH) % len(items.fault))
+    observation = clutter.observe(whole.scene, whole.poses)
+    keys = jax.random.split(aim, clutter.BATCH)
+    pushes, feasible = episodes.aim_pushes(keys, observation, 1, items.scene.shape.shape[1])
+    grasps = episodes.aim_grasps(keys, observation, 1)
+    index = np.flatnonzero(np.asarray(feasible)[: len(items.fault), 0])[:count]
+    pushes, grasps = (jax.tree.map(lambda leaf: np.asarray(leaf)[index, 0], x) for x in (pushes, grasps))
+    return Trial(structs.take(items, index), pushes, grasps)
+
+
+def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle `[...]` (radians) between orientations `[..., 4]`."""
+    return 2 * np.arccos(np.clip(np.abs((a * b).sum(-1)), 0.0, 1.0))
+
+
+def pushes(engine: Engine, made: Trial) -> tuple[Metrics, np.ndarray]:
+    """`push/...`: shares of what becomes of pushes and pushed objects; and the poses `[B, 12, N, 7]`."""
+    rollout = primitives.push(engine, made.items.scene, made.items.poses, made.pushes)
+    poses, fault = np.asarray(rollout.poses), np.asarray(rollout.fault)
+    moved = np.linalg.norm(poses[:, -1, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED
+    up = [np.asarray(geometry.quat_to_matrix(jnp.asarray(poses[:, k, :, 3:])))[..., 2, :] for k in (0, -1)]
+    tipped = np.arccos(np.clip((up[0] * up[1]).sum(-1), -1, 1)) > TIPPED
+    found = {"push/tipped_of_moved": float(tipped[moved].mean()), "push/moved_objects": float(moved.sum())}
+    for name, n in Fault.count(fault).items():
+        found[f"push/{name}"] = n / len(fault)
+    return found, poses
+
+
+def sweep(engine: Engine, made: Trial, poses: np.ndarray) -> Metrics:
+    """`sweep/{k}cm/...`: separate pushes, ended by a retreat, against the poses at `k` cm of a longer one."""
+    found = {}
+    for centimetres in (3, 5, 7):
+        short = made.pushes.replace(distance=np.full(len(poses), centimetres * 0.01, np.float32))
+        after = np.asarray(primitives.push(engine, made.items.scene, made.items.poses, short).poses)[:, -1]
+        found.update(_apart(f"sweep/{centimetres}cm", poses[:, centimetres], after, poses))
+    return found
+
+
+def _apart(name: str, found: np.ndarray, wanted: np.ndarray, poses: np.ndarray) -> Metrics:
+    """Quantiles of the distance and angle between poses `[B, N, 7]`, of objects that `poses [B, S, N, 7]` moves."""
+    moved = np.linalg.norm(poses[:, PUSH_STEPS, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED
+    distance = 1000 * np.linalg.norm(found[..., :3] - wanted[..., :3], axis=-1)[moved]
+    angle = np.rad2deg(_turn(found[..., 3:], wanted[..., 3:]))[moved]
+    if not moved.any():
+        return {}
+    return {
+        f"{name}/{q}_{unit}": float(np.quantile(values, share))
+        for unit, values in (("mm", distance), ("deg", angle))
+        for q, share in (("p50", 0.5), ("p90", 0.9))
+    }
+
+
+def agreement(name: str, engine: Engine, made: Trial, poses: np.ndarray, held: np.ndarray) -> Metrics:
+    """`agreement/{engine}/...`: against the reference's `poses [B, 12, N, 7]` and `held [B, N]`."""
+    rollout = primitives.push(engine, made.items.scene, made.items.poses, made.pushes)
+    found: Metrics = {}
+    for centimetres in (1, 5, 10):
+        at = np.asarray(rollout.poses)[:, centimetres]
+        found.update(_apart(f"agreement/{name}/{centimetres}cm", at, poses[:, centimetres], poses))
+    _, outcome = primitives.grasp(engine, made.items.scene, made.items.poses, made.grasps)
+    found[f"agreement/{name}/grasp"] = float((np.asarray(outcome.held) == held).all(-1).mean())
+    fault = np.asarray(rollout.fault)
+    found[f"agreement/{name}/unsettled"] = Fault.count(fault)["unsettled"] / len(fault)
+    found[f"agreement/{name}/scenes"] = len(fault)
+    return found
+
+
+def camera(engine: Engine, key: jax.Array, count: int) -> Metrics:
+    """`camera/...`: the renderer against MuJoCo's ray caster on scenes of ten objects."""
+    items = clutter.settled_exactly(key, engine, scenes.fixed_count(10), count)
+    seen = jax.jit(lambda scene, poses: jax.lax.map(lambda pair: render.render_depth(*pair), (scene, poses)))
+    height, label = (np.asarray(x) for x in seen(items.scene, jnp.asarray(items.poses)))
+    wanted_height, wanted_label = native.raycast(items.scene, items.poses)
+    same = label == wanted_label
+    return {
+        "camera/labels_equal": float(same.mean()),
+        "camera/height_max_mm": float(1000 * np.abs(height - wanted_height)[same].max()),
+        "camera/scenes": count,
+    }
+
+
+def held_by(engine: Engine, made: Trial) -> np.ndarray:
+    """What the reference holds after each grasp `[B, N]`."""
+    _, outcome = primitives.grasp(engine, made.items.scene, made.items.poses, made.grasps)
+    return np.asarray(outcome.held)

@@ -1,0 +1,242 @@
+"""Contact forces with elliptic friction cones that hold in float32, in place of MJX's solver.
+
+MJX's line search computes the squared length of a contact's tangential residual as `uu + a (2 uv + a vv)`. Where
+a Newton step ends sliding that is zero, in float32 often a little below it; the root is NaN, the cost of the whole
+step is NaN, and comparisons with NaN choose the wrong end of the bracket or none: the solver stops with forces
+that do not fit, and objects fly off. Here residuals are moved along the step before any length is taken.
+
+The problem is MuJoCo's: the acceleration that minimizes a convex cost ("Computation: soft contact model" in its
+documentation). Scaled by friction, a contact's residual `u` is to lie in the cone `u_0 >= mu |u_t|` and pays
+`stiffness / 2` times the squared distance to it, so cost, gradient and Hessian follow from one projection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco.mjx._src import solver, support
+from mujoco.mjx._src.types import ConeType, SolverType
+
+from dipn_jax.structs import Pytree
+
+DECREMENT = 1e-6
+"""Newton ends when the cost it can still gain is below this share of the cost (float32 resolves 1e-7)."""
+FLAT = 1e-2
+"""The line search ends when the slope is below this share of the slope at its beginning."""
+STRETCH = 4.0
+"""Most that a step of the line search grows while the minimum is further on."""
+_TINY = 1e-12
+
+
+@flax.struct.dataclass
+class _Problem(Pytree):
+    """Minimize `(a - free)' mass (a - free) / 2` plus what the rows and the cones of `a` pay."""
+
+    mass: jax.Array  # [V, V]
+    free: jax.Array  # [V] acceleration without constraints
+    force: jax.Array  # [V] mass @ free
+    rows: jax.Array  # [R, V] equalities and limits
+    goal: jax.Array  # [R]
+    weight: jax.Array  # [R]
+    always: jax.Array  # [R] bool: an equality, else one-sided
+    cones: jax.Array  # [C, K, V] normal and tangents of contacts, scaled
+    cone_goal: jax.Array  # [C, K]
+    stiffness: jax.Array  # [C]
+    mu: jax.Array  # [C] slope of the scaled cone
+
+
+@flax.struct.dataclass
+class _Reach(Pytree):
+    """Where residuals `u [C, K]` lie with respect to their cones."""
+
+    away: jax.Array  # [C, K] from the nearest point of the cone to u
+    below: jax.Array  # [C] bool: the nearest point is the tip
+    beside: jax.Array  # [C] share of a residual on the cone's side, 1 / (1 + mu^2); 0 elsewhere
+    inward: jax.Array  # [C, K] normal of the side, first component 1
+    tangent: jax.Array  # [C, K] unit vector of sliding, first component 0
+    bend: jax.Array  # [C] curvature across it, not negative
+
+
+def _reach(u: jax.Array, mu: jax.Array) -> _Reach:
+    slide = u.at[:, 0].set(0.0)
+    length = jnp.linalg.norm(slide, axis=-1)
+    tangent = slide / jnp.maximum(length, _TINY)[:, None]
+    below = (mu * u[:, 0] + length <= 0) & (u[:, 0] < 0)
+    short = jnp.minimum(u[:, 0] - mu * length, 0.0)  # of the side
+    beside = jnp.where(below | (short >= 0), 0.0, 1 / (1 + mu**2))
+    inward = (-mu[:, None] * tangent).at[:, 0].set(1.0)
+    away = jnp.where(below[:, None], u, (beside * short)[:, None] * inward)
+    return _Reach(away, below, beside, inward, tangent, -short * mu / jnp.maximum(length, _TINY))
+
+
+def _curvature(reach: _Reach, w: jax.Array) -> jax.Array:
+    """Second derivative `[C]` of half the squared distance along `w [C, K]`."""
+    along = (reach.tangent * w).sum(-1, keepdims=True)
+    across = (w - along * reach.tangent).at[:, 0].set(0.0)
+    side = (reach.inward * w).sum(-1) ** 2 + reach.bend * (across**2).sum(-1)
+    return jnp.where(reach.below, (w**2).sum(-1), reach.beside * side)
+
+
+def _blocks(reach: _Reach) -> jax.Array:
+    """Hessian `[C, K, K]` of half the squared distance: a sum of squares, so never indefinite by more than rounding."""
+    eye = jnp.eye(reach.away.shape[1])
+
+    def outer(v: jax.Array) -> jax.Array:
+        return v[:, :, None] * v[:, None, :]
+
+    across = eye.at[0, 0].set(0.0) - outer(reach.tangent)
+    side = outer(reach.inward) + reach.bend[:, None, None] * across
+    return jnp.where(reach.below[:, None, None], eye, reach.beside[:, None, None] * side)
+
+
+def _residuals(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Of rows `[R]` (zero where they do not push) and of cones `[C, K]`."""
+    return p.rows @ a - p.goal, p.cones @ a - p.cone_goal
+
+
+def _pushing(p: _Problem, x: jax.Array) -> jax.Array:
+    return jnp.where(p.always | (x < 0), p.weight, 0.0)
+
+
+def _cost(p: _Problem, a: jax.Array) -> jax.Array:
+    x, u = _residuals(p, a)
+    moved = a - p.free
+    contacts = p.stiffness * (_reach(u, p.mu).away ** 2).sum(-1)
+    return ((p.mass @ moved) @ moved + (_pushing(p, x) * x**2).sum() + contacts.sum()) / 2
+
+
+def _newton(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Cost `[]`, gradient and Newton step `[V]` at `a`."""
+    x, u = _residuals(p, a)
+    push, reach = _pushing(p, x), _reach(u, p.mu)
+    away = p.stiffness[:, None] * reach.away
+    lack = p.mass @ a - p.force
+    gradient = lack + (push * x) @ p.rows + jnp.einsum("ck,ckv->v", away, p.cones)
+    bent = p.stiffness[:, None, None] * (_blocks(reach) @ p.cones)
+    flat = p.cones.reshape(-1, p.cones.shape[-1])
+    hessian = p.mass + (p.rows.T * push) @ p.rows + flat.T @ bent.reshape(flat.shape)
+    size = jax.lax.rsqrt(jnp.diagonal(hessian))  # masses and inertias differ by 10^5
+    factor = jax.scipy.linalg.cho_factor(hessian * size[:, None] * size, lower=True)
+    step = -size * jax.scipy.linalg.cho_solve(factor, size * gradient)
+    cost = (lack @ (a - p.free) + (push * x**2).sum() + (away * reach.away).sum()) / 2
+    return cost, gradient, step
+
+
+def _line_search(p: _Problem, a: jax.Array, step: jax.Array, limit: int) -> jax.Array:
+    """The multiple of `step` with the least cost: Newton on the slope, kept in a bracket."""
+    x, u = _residuals(p, a)
+    dx, du = p.rows @ step, jnp.einsum("ckv,v->ck", p.cones, step)
+    lifted = p.mass @ step
+    slope_0, slope_1 = (p.mass @ a - p.force) @ step, lifted @ step
+
+    def slope(t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        at, reach = x + t * dx, _reach(u + t * du, p.mu)
+        push = _pushing(p, at)
+        first = slope_0 + t * slope_1 + (push * at * dx).sum() + (p.stiffness * (reach.away * du).sum(-1)).sum()
+        return first, slope_1 + (push * dx**2).sum() + (p.stiffness * _curvature(reach, du)).sum()
+
+    def going(state: Any) -> jax.Array:
+        return ~state[-1] & (state[-2] < limit)
+
+    def body(state: Any) -> Any:
+        low, high, t, count, _ = state
+        first, second = slope(t)
+        low, high = jnp.where(first < 0, t, low), jnp.where(first < 0, high, t)
+        found = jnp.abs(first) <= FLAT * jnp.abs(begin)
+        guess = t - first / second
+        middle = jnp.where(jnp.isfinite(high), (low + high) / 2, STRETCH * low)
+        inside = (guess > low) & (guess < jnp.minimum(high, STRETCH * jnp.maximum(low, t)))
+        return low, high, jnp.where(found, t, jnp.where(inside, guess, middle)), count + 1, found
+
+    begin = slope(jnp.zeros(()))[0]
+    zero = jnp.zeros_like(begin)
+    state = (zero, zero + jnp.inf, zero + 1, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+    low, _, t, _, found = jax.lax.while_loop(going, body, state)
+    return jnp.where(found, t, low)  # the cost falls all the way to `low`
+
+
+def _minimize(p: _Problem, start: jax.Array, iterations: int, line: int) -> jax.Array:
+    def going(state: Any) -> jax.Array:
+        return ~state[-1] & (state[-2] < iterations)
+
+    def body(state: Any) -> Any:
+        a, count, _ = state
+        cost, gradient, step = _newton(p, a)
+        gain = -(gradient @ step) / 2
+        a = a + jnp.where(gain > 0, _line_search(p, a, step, line), 0.0) * step
+        return a, count + 1, ~(gain > DECREMENT * cost)
+
+    return jax.lax.while_loop(going, body, (start, jnp.zeros((), jnp.int32), jnp.zeros((), bool)))[0]
+
+
+def _problem(m: Any, d: Any) -> tuple[_Problem, np.ndarray, jax.Array]:
+    """The problem, the constraint rows `[C, K]` of its cones (-1: none) and their scales `[C, K]`."""
+    impl, contact = d._impl, d._impl.contact
+    dims, first = np.asarray(contact.dim), np.asarray(contact.efc_address)
+    k = np.arange(dims.max())
+    index = np.where(k < dims[:, None], first[:, None] + k, -1)
+    others = np.setdiff1d(np.arange(impl.efc_J.shape[0]), index)
+    mu = contact.friction[:, 0] / jnp.sqrt(m.opt.impratio)
+    scale = jnp.concatenate([mu[:, None], contact.friction], -1)[:, : len(k)] * (index >= 0)
+    problem = _Problem(
+        mass=support.full_m(m, d),
+        free=d.qacc_smooth,
+        force=d.qfrc_smooth,
+        rows=impl.efc_J[others],
+        goal=impl.efc_aref[others],
+        weight=impl.efc_D[others],
+        always=jnp.asarray(others < impl.ne),
+        cones=scale[:, :, None] * impl.efc_J[index],
+        cone_goal=scale * impl.efc_aref[index],
+        stiffness=impl.efc_D[first] / jnp.maximum(mu**2, _TINY),
+        mu=mu,
+    )
+    return problem, index, scale
+
+
+def solve(m: Any, d: Any) -> Any:
+    """Constraint forces and accelerations of one state.
+
+    Args:
+      m: MJX model (JAX implementation, Newton, elliptic cone, no friction loss).
+      d: its data, up to `forward.fwd_acceleration`.
+
+    Returns:
+      `d` with `qacc`, `qfrc_constraint` and `efc_force`. The force is what the acceleration needs, so that an
+      implicit integrator, which starts from forces, does not multiply what is left of the gradient.
+    """
+    p, index, scale = _problem(m, d)
+    better = _cost(p, d.qacc_warmstart) < _cost(p, d.qacc_smooth)
+    start = jnp.where(better, d.qacc_warmstart, d.qacc_smooth)
+    a = _minimize(p, start, int(m.opt.iterations), int(m.opt.ls_iterations))
+    x, u = _residuals(p, a)
+    push = -p.stiffness[:, None] * _reach(u, p.mu).away * scale
+    others = np.setdiff1d(np.arange(d._impl.efc_J.shape[0]), index)
+    force = jnp.zeros_like(d._impl.efc_aref).at[others].set(-_pushing(p, x) * x)
+    force = force.at[np.where(index < 0, len(force), index)].set(push, mode="drop")
+    return d.tree_replace({"qacc": a, "qfrc_constraint": p.mass @ a - p.force, "_impl.efc_force": force})
+
+
+def _ours(m: Any, d: Any) -> bool:
+    """Whether `solve` knows all that the model has."""
+    elliptic = m.opt.cone == ConeType.ELLIPTIC and m.opt.solver == SolverType.NEWTON
+    return elliptic and not d._impl.nf and len(d._impl.contact.dim) > 0 and min(d._impl.contact.dim) > 1
+
+
+def _choosing(upstream: Callable[..., Any]) -> Callable[..., Any]:
+    def solve_constraints(m: Any, d: Any) -> Any:
+        return solve(m, d) if _ours(m, d) else upstream(m, d)
+
+    solve_constraints.upstream = upstream  # type: ignore[attr-defined]
+    return solve_constraints
+
+
+def register() -> None:
+    """Put `solve` in the place of MJX's for the models it knows; a second call changes nothing."""
+    if not hasattr(solver.solve, "upstream"):
+        solver.solve = _choosing(solver.solve)

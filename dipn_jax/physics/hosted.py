@@ -1,0 +1,159 @@
+"""Bookkeeping of a rollout on the host, for engines that step whole batches from there, tick by tick."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import jax
+import mujoco
+import numpy as np
+
+from dipn_jax import physics
+from dipn_jax.model import GRIPPER_DOF
+from dipn_jax.physics import faults
+from dipn_jax.structs import Rollout, Scene, Trajectory
+from dipn_jax.workspace import GRIPPER
+
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
+_FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}FULL")) for name in ("CONTACT", "CNSTR")]
+
+
+class Worlds(Protocol):
+    """A batch of simulations of the gripper and N objects."""
+
+    qpos: np.ndarray  # [B, 6 + 7 N]
+    qvel: np.ndarray  # [B, 6 + 6 N]
+    ctrl: np.ndarray  # [B, 6]
+    qfrc_applied: np.ndarray  # [B, 6 + 6 N]
+
+    @property
+    def warning(self) -> np.ndarray:
+        """Of each kind of mjtWarning (last info, count) `[B, W, 2]`."""
+        ...
+
+    def advance(self) -> np.ndarray:
+        """Simulate one control period; returns which simulations (indices) the engine gave up."""
+        ...
+
+    def depths(self) -> np.ndarray:
+        """Deepest contact `[B]` in metres, now."""
+        ...
+
+
+def follow(
+    sims: Worlds,
+    scenes: Scene,
+    slots: np.ndarray,
+    poses: np.ndarray,
+    trajectories: Trajectory,
+    samples: np.ndarray,
+    *,
+    settle: bool,
+    fence: float,
+) -> Rollout:
+    """Run `sims` along `trajectories`; arguments as `Engine.simulate`, but for `scenes` and `slots`, from `pack`."""
+    watch, present = Watch(scenes, sims), scenes.shape >= 0
+    mass = np.where(present, scenes.mass, 0.0)
+    ticks = np.round(samples / physics.CONTROL_PERIOD).astype(int)
+    stored = []
+    for tick in range(int(ticks[-1]) + 1):
+        if tick in ticks:
+            now = unpack(sims.qpos[:, GRIPPER_DOF:], poses, slots, present), gripper(sims.qpos)
+            stored += [now] * int((ticks == tick).sum())
+        if tick < ticks[-1]:
+            time = tick * physics.CONTROL_PERIOD
+            sims.ctrl[:] = controls(trajectories, time + GRIPPER.lag)
+            if fence:
+                hold_in(sims, mass, up=time < fence)
+            watch.raised(sims.advance())
+            watch.tick()
+    fault = watch.codes(controls(trajectories, float(samples[-1])), settle)
+    rollout, hand = (np.stack(part, 1).astype(np.float32) for part in zip(*stored, strict=True))
+    return Rollout(rollout, hand, fault)
+
+
+class Watch:
+    """Collects faults while a batch runs."""
+
+    def __init__(self, scenes: Scene, sims: Worlds) -> None:
+        self.scenes, self.sims = scenes, sims
+        self.broken = np.zeros(len(scenes.shape), bool)
+        self.top = np.zeros(len(scenes.shape))
+
+    def raised(self, ids: np.ndarray) -> None:
+        self.broken[ids] = True
+
+    def velocity(self) -> np.ndarray:
+        """Of the objects `[B, N, 6]`."""
+        return np.array(self.sims.qvel[:, GRIPPER_DOF:]).reshape(*self.scenes.shape.shape, 6)
+
+    def tick(self) -> None:
+        linear, _ = faults.speeds(self.scenes, self.velocity(), xp=np)
+        finite = np.isfinite(linear).all(-1)
+        self.broken |= ~finite
+        self.top = np.maximum(self.top, np.where(finite, linear.max(-1), 0.0))
+
+    def codes(self, target: np.ndarray, settle: bool) -> np.ndarray:
+        """Fault codes `[B]` at the end of a rollout."""
+        warning = np.asarray(self.sims.warning)[..., 1]  # (last info, count)
+        qpos = np.array(self.sims.qpos)
+        return faults.codes(
+            self.scenes,
+            qpos[:, GRIPPER_DOF:].reshape(*self.scenes.shape.shape, 7),
+            self.velocity(),
+            qpos[:, :3],
+            target[:, :3],
+            top=self.top,
+            broken=self.broken | (warning[:, _BAD] > 0).any(-1),
+            full=(warning[:, _FULL] > 0).any(-1),
+            depth=np.where(self.broken, 0.0, self.sims.depths()),
+            settle=settle,
+            xp=np,
+        )
+
+
+def pack(scenes: Scene, poses: np.ndarray) -> tuple[Scene, np.ndarray]:
+    """Present objects first, and only as many slots as the fullest scene needs; `slots [B, n]` says which."""
+    present = scenes.shape >= 0
+    n = max(1, int(present.sum(-1).max()))
+    slots = np.argsort(~present, axis=-1, kind="stable")[:, :n]
+
+    def take(leaf: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(leaf, slots.reshape(slots.shape + (1,) * (leaf.ndim - 2)), 1)
+
+    return jax.tree.map(take, scenes), slots
+
+
+def unpack(qpos: np.ndarray, poses: np.ndarray, slots: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Object poses `[B, N, 7]` in the caller's slots; empty slots keep their pose (as bodies they just fall)."""
+    out = np.array(poses)
+    fresh = np.array(qpos).reshape(*slots.shape, 7).astype(out.dtype)
+    old = np.take_along_axis(out, slots[..., None], 1)
+    np.put_along_axis(out, slots[..., None], np.where(present[..., None], fresh, old), 1)
+    return out
+
+
+def hold_in(sims: Worlds, mass: np.ndarray, *, up: bool) -> None:
+    """Apply the fence's forces for the next control period; none once it is no longer up."""
+    shape = mass.shape
+    position = np.asarray(sims.qpos)[:, GRIPPER_DOF:].reshape(*shape, 7)[..., :2]
+    velocity = np.asarray(sims.qvel)[:, GRIPPER_DOF:].reshape(*shape, 6)[..., :2]
+    force = np.zeros((*shape, 6))
+    if up:
+        force[..., :2] = physics.fence_force(mass, position, velocity, xp=np)
+    sims.qfrc_applied[:, GRIPPER_DOF:] = force.reshape(len(force), -1)
+
+
+def controls(trajectories: Trajectory, time: float) -> np.ndarray:
+    """Actuator set points `[B, 6]` at `time`: linear between key frames, gap split over both fingers."""
+    times, targets = trajectories.time, trajectories.target
+    index = np.clip((times <= time).sum(-1) - 1, 0, times.shape[1] - 2)
+    rows = np.arange(len(times))
+    t0, t1 = times[rows, index], times[rows, index + 1]
+    weight = np.clip((time - t0) / np.maximum(t1 - t0, 1e-9), 0.0, 1.0)[:, None]
+    pose = targets[rows, index] * (1 - weight) + targets[rows, index + 1] * weight
+    return np.concatenate([pose[:, :4], pose[:, 4:] / 2, pose[:, 4:] / 2], -1)
+
+
+def gripper(qpos: np.ndarray) -> np.ndarray:
+    return np.concatenate([qpos[:, :4], qpos[:, 4:5] + qpos[:, 5:6]], -1)
