@@ -10,7 +10,7 @@ import numpy as np
 
 from datagen import episodes, isolated
 from dipn_jax import clutter, geometry, primitives, render, scenes, shapes, structs
-from dipn_jax.physics import Engine, native
+from dipn_jax.physics import Engine, EngineName, native
 from dipn_jax.structs import Fault, Grasp, Push, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
 
@@ -20,13 +20,14 @@ MOVED = 0.001
 """Metres: what the reference moves by more during a push counts in the engines' agreement."""
 TIPPED = np.deg2rad(45)
 """Radians by which an object's own axes tilt when it tips over or rolls."""
-ENGINES: dict[str, tuple[str, float | None]] = {
+ENGINES: dict[str, tuple[EngineName, float | None]] = {
     "native_1ms": ("native", 0.001),
     "native_3.3ms": ("native", 0.01 / 3),
     "native_5ms": ("native", 0.005),
     "mjx": ("mjx", None),
+    "warp": ("warp", None),
 }
-"""What is held against `native` at its own 2 ms: engine and time step (None: its own)."""
+"""What can be held against `native` at its own 2 ms: engine and time step (None: its own)."""
 Metrics = dict[str, float]
 
 
@@ -147,9 +148,12 @@ def camera(engine: Engine, key: jax.Array, count: int) -> Metrics:
     height, label = (np.asarray(x) for x in seen(items.scene, jnp.asarray(items.poses)))
     wanted_height, wanted_label = native.raycast(items.scene, items.poses)
     same = label == wanted_label
+    apart = 1000 * np.abs(height - wanted_height)[same]
     return {
         "camera/labels_equal": float(same.mean()),
-        "camera/height_max_mm": float(1000 * np.abs(height - wanted_height)[same].max()),
+        "camera/heights_equal": float((apart < 0.1).mean()),
+        "camera/heights_apart": int((apart >= 0.1).sum()),
+        "camera/height_max_mm": float(apart.max()),
         "camera/scenes": count,
     }
 

@@ -13,14 +13,7 @@ from eval import cli as eval_cli
 from train import cli as train_cli
 
 COMMANDS = {
-    "datagen": {
-        "push": datagen_cli.push,
-        "grasp": datagen_cli.grasp,
-        "images": datagen_cli.images,
-        "verify": datagen_cli.verify,
-        "repair": datagen_cli.repair,
-        "info": datagen_cli.info,
-    },
+    "datagen": datagen_cli.COMMANDS,
     "train": {"push": train_cli.push, "grasp-pretrain": train_cli.grasp_pretrain, "grasp": train_cli.grasp},
     "eval": {
         "prediction": eval_cli.predict,

@@ -5,6 +5,9 @@ a Newton step ends sliding that is zero, in float32 often a little below it; the
 step is NaN, and comparisons with NaN choose the wrong end of the bracket or none: the solver stops with forces
 that do not fit, and objects fly off. Here residuals are moved along the step before any length is taken.
 
+What is left of the gradient must not become motion: `forward.implicit` divides the sum of forces by the mass alone,
+so a residue of 1e-3 N m on a light object is a kick of 0.1 rad/s. The force returned is the acceleration's.
+
 The problem is MuJoCo's: the acceleration that minimizes a convex cost ("Computation: soft contact model" in its
 documentation). Scaled by friction, a contact's residual `u` is to lie in the cone `u_0 >= mu |u_t|` and pays
 `stiffness / 2` times the squared distance to it, so cost, gradient and Hessian follow from one projection.
@@ -63,6 +66,7 @@ class _Reach(Pytree):
 
 
 def _reach(u: jax.Array, mu: jax.Array) -> _Reach:
+    """Project `u [C, K]` on the cones `u_0 >= mu |u_t|`."""
     slide = u.at[:, 0].set(0.0)
     length = jnp.linalg.norm(slide, axis=-1)
     tangent = slide / jnp.maximum(length, _TINY)[:, None]
@@ -95,11 +99,12 @@ def _blocks(reach: _Reach) -> jax.Array:
 
 
 def _residuals(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Of rows `[R]` (zero where they do not push) and of cones `[C, K]`."""
+    """Of rows `[R]` and of cones `[C, K]`."""
     return p.rows @ a - p.goal, p.cones @ a - p.cone_goal
 
 
 def _pushing(p: _Problem, x: jax.Array) -> jax.Array:
+    """Weights `[R]` of rows with residuals `x`, zero for those that do not push."""
     return jnp.where(p.always | (x < 0), p.weight, 0.0)
 
 
@@ -127,25 +132,32 @@ def _newton(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]
     return cost, gradient, step
 
 
-def _line_search(p: _Problem, a: jax.Array, step: jax.Array, limit: int) -> jax.Array:
-    """The multiple of `step` with the least cost: Newton on the slope, kept in a bracket."""
+def _slopes(p: _Problem, a: jax.Array, step: jax.Array) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
+    """First and second derivative of the cost along `step`, as a function of the multiple taken."""
     x, u = _residuals(p, a)
-    dx, du = p.rows @ step, jnp.einsum("ckv,v->ck", p.cones, step)
-    lifted = p.mass @ step
-    slope_0, slope_1 = (p.mass @ a - p.force) @ step, lifted @ step
+    dx, du = p.rows @ step, p.cones @ step
+    slope_0, slope_1 = (p.mass @ a - p.force) @ step, (p.mass @ step) @ step
 
-    def slope(t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        at, reach = x + t * dx, _reach(u + t * du, p.mu)
+    def slopes(t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        at, reach = x + t * dx, _reach(u + t * du, p.mu)  # first moved, then measured: nothing cancels
         push = _pushing(p, at)
         first = slope_0 + t * slope_1 + (push * at * dx).sum() + (p.stiffness * (reach.away * du).sum(-1)).sum()
         return first, slope_1 + (push * dx**2).sum() + (p.stiffness * _curvature(reach, du)).sum()
 
-    def going(state: Any) -> jax.Array:
+    return slopes
+
+
+def _line_search(p: _Problem, a: jax.Array, step: jax.Array, limit: int) -> jax.Array:
+    """The multiple of `step` with the least cost: Newton on the slope, kept in a bracket."""
+    slopes = _slopes(p, a, step)
+    begin = slopes(jnp.zeros(()))[0]
+
+    def going(state: tuple[jax.Array, ...]) -> jax.Array:
         return ~state[-1] & (state[-2] < limit)
 
-    def body(state: Any) -> Any:
+    def body(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         low, high, t, count, _ = state
-        first, second = slope(t)
+        first, second = slopes(t)
         low, high = jnp.where(first < 0, t, low), jnp.where(first < 0, high, t)
         found = jnp.abs(first) <= FLAT * jnp.abs(begin)
         guess = t - first / second
@@ -153,25 +165,27 @@ def _line_search(p: _Problem, a: jax.Array, step: jax.Array, limit: int) -> jax.
         inside = (guess > low) & (guess < jnp.minimum(high, STRETCH * jnp.maximum(low, t)))
         return low, high, jnp.where(found, t, jnp.where(inside, guess, middle)), count + 1, found
 
-    begin = slope(jnp.zeros(()))[0]
     zero = jnp.zeros_like(begin)
-    state = (zero, zero + jnp.inf, zero + 1, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+    state: tuple[jax.Array, ...] = (zero, zero + jnp.inf, zero + 1, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
     low, _, t, _, found = jax.lax.while_loop(going, body, state)
     return jnp.where(found, t, low)  # the cost falls all the way to `low`
 
 
 def _minimize(p: _Problem, start: jax.Array, iterations: int, line: int) -> jax.Array:
-    def going(state: Any) -> jax.Array:
+    """The acceleration `[V]` with the least cost."""
+
+    def going(state: tuple[jax.Array, ...]) -> jax.Array:
         return ~state[-1] & (state[-2] < iterations)
 
-    def body(state: Any) -> Any:
+    def body(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         a, count, _ = state
         cost, gradient, step = _newton(p, a)
         gain = -(gradient @ step) / 2
         a = a + jnp.where(gain > 0, _line_search(p, a, step, line), 0.0) * step
         return a, count + 1, ~(gain > DECREMENT * cost)
 
-    return jax.lax.while_loop(going, body, (start, jnp.zeros((), jnp.int32), jnp.zeros((), bool)))[0]
+    state: tuple[jax.Array, ...] = (start, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+    return jax.lax.while_loop(going, body, state)[0]
 
 
 def _problem(m: Any, d: Any) -> tuple[_Problem, np.ndarray, jax.Array]:

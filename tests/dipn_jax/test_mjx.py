@@ -24,8 +24,8 @@ from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene
 
 BATCH, SLOTS = 4, 3
 POSITION_TOLERANCE = 0.003
-"""Metres between the engines after 5 cm of a push: float32 and another solver. Measured 0.3 mm on these scenes; on 32
-random ones the median is 0.7 mm and the 90th percentile 7 mm, as contacts between objects multiply differences."""
+"""Metres between the engines after 5 cm of a push: float32 and another solver. On 32 random scenes (docs/world.md) the
+90th percentile is 1.3 mm, as contacts between objects multiply differences."""
 DEPTH_TOLERANCE = 1e-4
 """Metres of contact depth; 0.05 mm of it is `prisms.PREFER_FACE`. Measured: 1e-8 on these pairs."""
 DEEPEST = 0.003

@@ -1,0 +1,147 @@
+"""`dipn-datagen check-world`: the figures of `world`, section by section, and the page that shows them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from datagen import world
+from dipn_jax import clutter, console, files, shapes
+from dipn_jax.errors import UserError
+from dipn_jax.physics import Engine, make_engine
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How much is measured."""
+
+    engines: tuple[str, ...]
+    scenes: int
+    few: int  # scenes for warp, which is slow on a CPU
+    tries: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.engines if name not in world.ENGINES]
+        if unknown:
+            raise UserError(f"--engines {' '.join(unknown)}: want some of {' '.join(world.ENGINES)}")
+        console.require_between(1, clutter.BATCH // 2, scenes=self.scenes, few=self.few)
+        console.require_between(1, 1000, tries=self.tries)
+        console.require_seed(self.seed)
+
+
+def run(out: pathlib.Path, plan: Plan) -> None:
+    """Measure and write `metrics.json` and `world.md`; sections already measured with this plan are not repeated.
+
+    Raises:
+      UserError: an engine cannot run here, or the folder belongs to another plan.
+    """
+    console.require_out(out)
+    engines = {}
+    for name in plan.engines:
+        kind, timestep = world.ENGINES[name]
+        engines[name] = make_engine(kind, timestep=timestep)
+    settings = json.loads(json.dumps(dataclasses.asdict(plan)))
+    files.claim(out, settings, free=("engines",))
+    sections = _sections(plan, engines)
+    metrics: dict[str, float] = {}
+    with console.Progress("check-world", len(sections), unit="sections") as progress:
+        for name, measure in sections.items():
+            path = out / "sections" / f"{name}.json"
+            if not path.exists():
+                files.write_json(path, measure())
+            metrics.update(files.read_json(path))
+            progress.advance(1, name)
+    finite = {k: None if not np.isfinite(v) else v for k, v in metrics.items()}
+    files.write_json(out / "settings.json", {**settings, "versions": files.package_versions()})
+    files.write_json(out / "metrics.json", finite)
+    files.write_atomically(out / "world.md", page(metrics).encode())
+    console.say(page(metrics))
+
+
+def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], dict[str, float]]]:
+    """What is measured, by name."""
+    native = make_engine("native")
+    keys = jax.random.split(jax.random.key(plan.seed), 3)
+    known: dict[str, Any] = {}
+
+    def reference() -> tuple[world.Trial, dict[str, float], np.ndarray, np.ndarray]:
+        if not known:
+            made = world.trial(native, keys[1], plan.scenes)
+            found, poses = world.pushes(native, made)
+            known["all"] = made, found, poses, world.held_by(native, made)
+        return known["all"]
+
+    def agree(name: str, engine: Engine) -> dict[str, float]:
+        made, _, poses, held = reference()
+        count = min(plan.few, plan.scenes) if name == "warp" else plan.scenes
+        return world.agreement(name, engine, made.first(count), poses[:count], held[:count])
+
+    return {
+        "drops": lambda: world.drops(native, keys[0], clutter.BATCH),
+        "grasps": lambda: world.isolated_grasps(native, plan.seed, plan.tries),
+        "pushes": lambda: reference()[1],
+        "sweep": lambda: world.sweep(native, reference()[0], reference()[2]),
+        "camera": lambda: world.camera(native, keys[2], min(50, plan.scenes + 18)),
+        **{f"agreement-{name}": lambda name=name, e=e: agree(name, e) for name, e in engines.items()},  # type: ignore[misc]
+    }
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def page(metrics: dict[str, float]) -> str:
+    """The figures as Markdown."""
+
+    def share(key: str) -> str:
+        value = metrics.get(key)
+        return "" if value is None or not np.isfinite(value) else f"{100 * value:.0f} %"
+
+    def pair(key: str, unit: str) -> str:
+        low, high = metrics.get(f"{key}/p50_{unit}"), metrics.get(f"{key}/p90_{unit}")
+        return "" if low is None or high is None else f"{low:.2f} / {high:.2f}"
+
+    drop_columns = ["kept", "outside", "unsettled", "speed", "penetration", "capacity", "non_finite"]
+    drops = [[str(n), *(share(f"drop/{n}/{c}") for c in drop_columns)] for n in world.COUNTS]
+    grasps = [[i.name, share(f"grasp_isolated/{i.name}"), f"{metrics[f'grasp_isolated_tries/{i.name}']:.0f}"]
+              for i in shapes.CATALOGUE]  # fmt: skip
+    compared = [name for name in world.ENGINES if f"agreement/{name}/grasp" in metrics]
+    engines = [
+        [name, f"{metrics[f'agreement/{name}/scenes']:.0f}"]
+        + [pair(f"agreement/{name}/{at}", unit) for at in ("1cm", "5cm", "10cm") for unit in ("mm", "deg")]
+        + [share(f"agreement/{name}/grasp"), share(f"agreement/{name}/unsettled")]
+        for name in compared
+    ]
+    sweeps = [[f"{k} cm", pair(f"sweep/{k}cm", "mm"), pair(f"sweep/{k}cm", "deg")] for k in (3, 5, 7)]
+    pushed = [[k.removeprefix("push/"), share(k)] for k in metrics if k.startswith("push/") and "objects" not in k]
+    at = " / ".join
+    return "\n\n".join(
+        [
+            "## Drops", _table(["objects", *drop_columns], drops),
+            "## Grasps of single objects, centred and antipodal, off by up to 1 cm and 7.5 degrees",
+            _table(["item", "held", "tries"], grasps),
+            f"Closing on the 100 mm side: {share('grasp_too_wide/held')} held; one finger on top of an object of "
+            f"20 kg: {share('grasp_on_top/held')}.",
+            f"## Pushes of 10 cm, {metrics['push/moved_objects']:.0f} objects moved", _table(["what", "share"], pushed),
+            "## A push of its own against the same centimetre of a longer one " + at(["p50", "p90"]),
+            _table(["after", "mm", "degrees"], sweeps),
+            "## Camera against MuJoCo's ray caster",
+            f"{metrics['camera/scenes']:.0f} scenes of ten objects: labels equal on "
+            f"{100 * metrics['camera/labels_equal']:.4f} % of pixels; heights there within 0.1 mm but for "
+            f"{metrics['camera/heights_apart']:.0f} on edges (largest {metrics['camera/height_max_mm']:.2f} mm).",
+            "## Engines against `native` at 2 ms, objects that it moves: " + at(["p50", "p90"]),
+            _table(
+                ["engine", "scenes"] + [f"{c} cm, {u}" for c in (1, 5, 10) for u in ("mm", "deg")]
+                + ["grasps equal", "unsettled"],
+                engines,
+            ),
+        ]
+    ) + "\n"  # fmt: skip

@@ -1,0 +1,69 @@
+"""The solver for elliptic cones against SciPy, on the cost as MuJoCo's documentation has it."""
+
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import scipy.optimize
+
+from dipn_jax.physics import cone
+
+V, ROWS, CONES = 9, 3, 4
+
+
+def _problem(rng: np.random.Generator, *, sticking: bool) -> cone._Problem:
+    """Random bodies, masses a thousandfold apart; where they stick, the free acceleration is tangential."""
+    spread = 10 ** rng.uniform(-1.5, 1.5, V)
+    basis = rng.normal(size=(V, V))
+    mass = (basis @ basis.T / V + np.eye(V)) * np.sqrt(spread[:, None] * spread)
+    free = rng.normal(size=V) * 10
+    goal = rng.normal(size=(CONES, 3)) * ([5, 0, 0] if sticking else [5, 1, 1])
+    made = cone._Problem(
+        mass=mass,
+        free=free,
+        force=mass @ free,
+        rows=rng.normal(size=(ROWS, V)),
+        goal=rng.normal(size=ROWS),
+        weight=10 ** rng.uniform(0, 3, ROWS),
+        always=np.arange(ROWS) < 1,
+        cones=rng.normal(size=(CONES, 3, V)) * np.array([0.16, 0.5, 0.5])[:, None],
+        cone_goal=goal,
+        stiffness=10 ** rng.uniform(1, 4, CONES),
+        mu=np.full(CONES, 0.16),
+    )
+    return jax.tree.map(lambda x: np.asarray(x, bool if np.asarray(x).dtype == bool else np.float32), made)
+
+
+def _cost(p: Any, a: np.ndarray) -> float:
+    """Quadratic rows, and for each contact the zones top (free), bottom (quadratic) and middle (cone)."""
+    x = p.rows @ a - p.goal
+    total = (a - p.free) @ p.mass @ (a - p.free) / 2 + (np.where(p.always | (x < 0), p.weight, 0) * x**2).sum() / 2
+    for i in range(CONES):
+        u = p.cones[i] @ a - p.cone_goal[i]
+        normal, tangent, mu = u[0], np.linalg.norm(u[1:]), p.mu[i]
+        if mu * normal + tangent <= 0:
+            total += p.stiffness[i] * (normal**2 + tangent**2) / 2
+        elif normal < mu * tangent:
+            total += p.stiffness[i] / (1 + mu**2) * (normal - mu * tangent) ** 2 / 2
+    return float(total)
+
+
+@pytest.mark.parametrize("sticking", [False, True])
+def test_the_least_cost_is_found_in_float32(sticking: bool) -> None:
+    solve = jax.jit(lambda p, start: cone._minimize(p, start, 50, 50))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        p = _problem(rng, sticking=sticking)
+        found = np.asarray(solve(p, np.zeros(V, np.float32)), float)
+        exact = jax.tree.map(lambda x: x.astype(float) if x.dtype != bool else x, p)
+        best = scipy.optimize.minimize(lambda a, p=exact: _cost(p, a), found, method="BFGS", options={"gtol": 1e-9})
+        assert _cost(exact, np.asarray(p.free)) > 2 * best.fun, "constraints matter"
+        assert _cost(exact, found) <= best.fun * (1 + 1e-5), (_cost(exact, found), best.fun)
+
+
+def test_a_second_registration_changes_nothing() -> None:
+    cone.register()
+    once = cone.solver.solve
+    cone.register()
+    assert cone.solver.solve is once
