@@ -45,8 +45,8 @@ def run(out: pathlib.Path, plan: Plan) -> None:
     console.require_out(out)
     engines = {}
     for name in plan.engines:
-        kind, timestep = world.ENGINES[name]
-        engines[name] = make_engine(kind, timestep=timestep)
+        kind, changes = world.ENGINES[name]
+        engines[name] = make_engine(kind, **changes)
     settings = json.loads(json.dumps(dataclasses.asdict(plan)))
     files.claim(out, settings, free=("engines",))
     sections = _sections(plan, engines)
@@ -73,7 +73,7 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
 
     def reference() -> tuple[world.Trial, dict[str, float], np.ndarray, np.ndarray]:
         if not known:
-            made = world.trial(native, keys[1], plan.scenes)
+            made = world.trial(keys[1], native, plan.scenes)
             found, poses = world.pushes(native, made)
             known["all"] = made, found, poses, world.held_by(native, made)
         return known["all"]
@@ -84,11 +84,11 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
         return world.agreement(name, engine, made.first(count), poses[:count], held[:count])
 
     return {
-        "drops": lambda: world.drops(native, keys[0], clutter.BATCH),
+        "drops": lambda: world.drops(keys[0], native, clutter.BATCH),
         "grasps": lambda: world.isolated_grasps(native, plan.seed, plan.tries),
         "pushes": lambda: reference()[1],
         "sweep": lambda: world.sweep(native, reference()[0], reference()[2]),
-        "camera": lambda: world.camera(native, keys[2], min(50, plan.scenes + 18)),
+        "camera": lambda: world.camera(keys[2], native, min(50, plan.scenes + 18)),
         **{f"agreement-{name}": lambda name=name, e=e: agree(name, e) for name, e in engines.items()},  # type: ignore[misc]
     }
 

@@ -132,7 +132,7 @@ def images(
 
 def check_world(
     out: pathlib.Path,
-    engines: tuple[str, ...] = ("native_1ms", "native_3.3ms", "native_5ms", "mjx"),
+    engines: tuple[str, ...] = ("native_awake", "native_1ms", "native_3.3ms", "native_5ms", "mjx"),
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 32,
     few: int = 8,
     tries: int = 100,
@@ -145,7 +145,7 @@ def check_world(
 
     Args:
       out: folder for metrics.json and world.md; asking again goes on where it stopped.
-      engines: which of native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native at 2 ms.
+      engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
       scenes_: scenes with a push and a grasp each.
       few: as many of them for warp, which makes about 60 steps a second on a CPU.
       tries: grasps of every catalogue item.

@@ -10,16 +10,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import candidates, clutter, primitives, scenes, structs
+from dipn_jax import candidates, clutter, primitives, render, scenes, structs
 from dipn_jax.physics import Engine
 from dipn_jax.structs import (
     Fault,
     Grasp,
     GraspEpisode,
-    Observation,
     Push,
     PushEpisode,
-    SettledScene,
+    Scene,
 )
 from dipn_jax.workspace import PUSH_STEPS
 
@@ -30,20 +29,6 @@ class Batch:
 
     episodes: Any
     counts: dict[str, int]
-
-
-def _look(
-    key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int
-) -> tuple[SettledScene, Observation | None, dict[str, int]]:
-    """Settled scenes, what the camera sees of them (None if there are none), and counts.
-
-    Observations are `[clutter.BATCH]`, scenes repeated to fill them, so that compiled shapes stay few.
-    """
-    items, counts = clutter.settled(key, engine, config, count)
-    if not len(items.fault):
-        return items, None, counts
-    filled = structs.take(items, np.arange(clutter.BATCH) % len(items.fault))
-    return items, clutter.observe(filled.scene, filled.poses), counts
 
 
 def push_batch(
@@ -57,13 +42,13 @@ def push_batch(
 ) -> Batch:
     """`actions` different pushes on each of up to `count` settled scenes, each once for every one of `distances`."""
     drop, aim = jax.random.split(key)
-    items, observation, counts = _look(drop, engine, config, count)
-    if observation is None:
-        return Batch(None, counts)
+    items, counts = clutter.settled(drop, engine, config, count)
     n = len(items.fault)
-    pushes, feasible = aim_pushes(jax.random.split(aim, clutter.BATCH), observation, actions, config.slots)
-    keep = np.asarray(feasible)[:n].reshape(-1)
-    pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:])[keep], pushes)
+    if not n:
+        return Batch(None, counts)
+    pushes, feasible = aim_pushes(jax.random.split(aim, n), items.scene, items.poses, actions=actions)
+    keep = np.asarray(feasible).reshape(-1)
+    pushes = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:])[keep], pushes)
     counts["infeasible_pushes"] = int((~keep).sum())
     if not keep.any():
         return Batch(None, counts)
@@ -76,14 +61,19 @@ def push_batch(
     return _drop_unusable(episodes, counts)
 
 
-@functools.partial(jax.jit, static_argnames=("actions", "slots"))
-def aim_pushes(keys: jax.Array, observation: Observation, actions: int, slots: int) -> tuple[Push, jax.Array]:
-    """Random pushes `[B, actions]` of observations `[B]`, and which are feasible."""
+def aim_pushes(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> tuple[Push, jax.Array]:
+    """Random 10 cm pushes `[B, actions]` of what is seen of scenes `[B, N]` at `poses [B, N, 7]`; whether feasible."""
+    return clutter.in_chunks(functools.partial(_aim_pushes, actions=actions), keys, scene, poses)
 
-    def one(args: tuple[jax.Array, Observation]) -> tuple[Push, jax.Array]:
-        return candidates.sample_pushes(args[0], args[1], count=actions, slots=slots, distance=PUSH_STEPS * 0.01)
 
-    return jax.lax.map(one, (keys, observation))
+@functools.partial(jax.jit, static_argnames="actions")
+def _aim_pushes(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int) -> tuple[Push, jax.Array]:
+    def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Push, jax.Array]:
+        slots = args[1].shape.shape[0]
+        seen = render.render(*args[1:])
+        return candidates.sample_pushes(args[0], seen, count=actions, slots=slots, distance=PUSH_STEPS * 0.01)
+
+    return jax.lax.map(one, (keys, scene, poses))
 
 
 def grasp_batch(
@@ -91,12 +81,12 @@ def grasp_batch(
 ) -> Batch:
     """`actions` grasps at random foreground pixels and angles on each of up to `count` settled scenes."""
     drop, aim = jax.random.split(key)
-    items, observation, counts = _look(drop, engine, config, count)
-    if observation is None:
-        return Batch(None, counts)
+    items, counts = clutter.settled(drop, engine, config, count)
     n = len(items.fault)
-    grasps = aim_grasps(jax.random.split(aim, clutter.BATCH), observation, actions)
-    grasps = jax.tree.map(lambda leaf: np.asarray(leaf)[:n].reshape(-1, *leaf.shape[2:]), grasps)
+    if not n:
+        return Batch(None, counts)
+    grasps = aim_grasps(jax.random.split(aim, n), items.scene, items.poses, actions=actions)
+    grasps = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     repeated = structs.take(items, np.repeat(np.arange(n), actions))
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
     episodes = GraspEpisode(
@@ -111,10 +101,17 @@ def grasp_batch(
     return _drop_unusable(episodes, counts)
 
 
+def aim_grasps(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> Grasp:
+    """Random grasps `[B, actions]` of the foreground seen of scenes `[B, N]` at `poses [B, N, 7]`."""
+    return clutter.in_chunks(functools.partial(_aim_grasps, actions=actions), keys, scene, poses)
+
+
 @functools.partial(jax.jit, static_argnames="actions")
-def aim_grasps(keys: jax.Array, observation: Observation, actions: int) -> Grasp:
-    """Random grasps `[B, actions]` of the foreground of observations `[B]`."""
-    return jax.lax.map(lambda args: candidates.random_grasps(args[0], args[1], count=actions), (keys, observation))
+def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int) -> Grasp:
+    def one(args: tuple[jax.Array, Scene, jax.Array]) -> Grasp:
+        return candidates.random_grasps(args[0], render.render(*args[1:]), count=actions)
+
+    return jax.lax.map(one, (keys, scene, poses))
 
 
 def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, **_: Any) -> Batch:

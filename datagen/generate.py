@@ -15,7 +15,7 @@ from typing import Any
 import jax
 
 from datagen import episodes
-from dipn_jax import clutter, console, files, records, structs
+from dipn_jax import console, files, records, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, EngineName, make_engine, resolve
 from dipn_jax.scenes import SceneConfig
@@ -92,7 +92,7 @@ def shard(job: Job, index: int, engine: Engine, tally: _Tally) -> tuple[Any, dic
     while have < want:
         key, batch_key = jax.random.split(key)
         # a tenth more than needed, for scenes that are dropped
-        count = min(clutter.BATCH, int(1.1 * (want - have) / each) + 1)
+        count = min(engine.batch, int(1.1 * (want - have) / each) + 1)
         batch = make(batch_key, engine, job.scene, count=count, actions=job.actions, distances=job.distances)
         counts.update(batch.counts)
         empty = empty + 1 if batch.episodes is None else 0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,13 +30,13 @@ def settled(
       key: random key.
       engine: physics.
       config: distributions.
-      count: scenes dropped, at most BATCH.
+      count: scenes dropped.
 
     Returns:
       The scenes kept `[K]`, and how many were dropped and why others were not kept.
     """
-    made = _random_scenes(jax.random.split(key, BATCH), config)
-    scene, poses = structs.take(made, slice(0, count))
+    draw = functools.partial(_random_scenes, config=config)
+    scene, poses = jax.tree.map(np.asarray, in_chunks(draw, jax.random.split(key, count)))
     rollout = primitives.settle(engine, scene, poses, fence=primitives.FENCE_TIME)
     fault = np.asarray(rollout.fault)
     everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)
@@ -52,7 +54,7 @@ def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, 
     in_vain = 0
     while (missing := count - sum(len(batch.fault) for batch in kept)) > 0:
         key, drop = jax.random.split(key)
-        tries = min(BATCH, int(1.2 * missing) + 2)
+        tries = min(engine.batch, int(1.2 * missing) + 2)
         batch, counts = settled(drop, engine, config, tries)
         in_vain = 0 if len(batch.fault) else in_vain + tries
         if in_vain >= MAX_DROPS:
@@ -68,9 +70,27 @@ def _random_scenes(keys: jax.Array, config: scenes.SceneConfig) -> tuple[Scene, 
     return jax.vmap(lambda k: scenes.random_scene(k, config=config))(keys)
 
 
+def in_chunks(function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)` for any number of rows: BATCH at a time, so that one compiled shape serves all.
+
+    Args:
+      function: jitted, of pytrees with a leading axis of BATCH rows, each row by itself.
+      args: pytrees with a leading axis.
+
+    Returns:
+      What `function` returns, its rows joined.
+    """
+    count = len(jax.tree.leaves(args)[0])
+    parts = []
+    for start in range(0, count, BATCH):
+        rows = np.arange(start, start + BATCH) % count
+        parts.append(function(*jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
+
+
 def observe(scene: Scene, poses: Array) -> Observation:
     """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
-    return _observe(jax.tree.map(jnp.asarray, scene), jnp.asarray(poses))
+    return in_chunks(_observe, scene, poses)
 
 
 @jax.jit

@@ -32,6 +32,7 @@ class PhysicsConfig:
     cone: str = "elliptic"  # or pyramidal
     solref: str = "0.01 1"  # softer makes grasps wrong
     solimp: str = "0.95 0.99 0.001"
+    sleep: float = 0.0  # m/s below which resting objects are left out of a step until something comes (0: never)
     geom_pairs: int = -1  # MJX: mesh-mesh pairs kept by the broad phase (-1: all)
     contact_points: int = -1  # MJX: contacts kept (-1: all)
 
@@ -173,12 +174,12 @@ def mjcf(
     extra = "" if library is None else _fillers(scene, library)
     if generic:
         extra = _mesh("part", shapes.CLASSES.index("cylinder"), 0, np.full(3, 0.05))
-    c = config
+    c, sleep = config, ' sleep="enable"' if config.sleep else ""
     return f"""<mujoco model="dipn">
 <compiler angle="radian"/>
 <option timestep="{c.timestep}" integrator="implicitfast" solver="Newton" cone="{c.cone}" impratio="{c.impratio}"
- iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="1e-8" jacobian="dense">
- <flag multiccd="enable" autoreset="disable"/></option>
+ iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="1e-8" jacobian="dense"
+ sleep_tolerance="{c.sleep}"> <flag multiccd="enable" autoreset="disable"{sleep}/></option>
 <custom><numeric name="max_geom_pairs" data="{c.geom_pairs}"/>
  <numeric name="max_contact_points" data="{c.contact_points}"/></custom>
 <default><geom solref="{c.solref}" solimp="{c.solimp}"/>

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from types import ModuleType
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +61,8 @@ class Engine(Protocol):
 
     name: str
     config: PhysicsConfig
+    batch: int
+    """Scenes it is best given at a time: data sets are made in batches of as many."""
 
     def simulate(
         self,
@@ -106,31 +108,30 @@ def resolve(name: EngineName) -> EngineName:
     return name
 
 
-def make_engine(name: EngineName, *, timestep: float | None = None) -> Engine:
+def make_engine(name: EngineName, *, timestep: float | None = None, sleep: float | None = None) -> Engine:
     """The engine called `name`, with its own solver settings.
 
     Args:
       name: engine, or `auto`.
       timestep: seconds of a physics step, instead of the engine's own.
+      sleep: `PhysicsConfig.sleep`, instead of the engine's own; only `native` can.
 
     Raises:
-      UserError: no such engine, or a time step that does not divide the control period.
+      UserError: no such engine, it cannot run here, or a time step that does not divide the control period.
     """
+    given = {"timestep": timestep, "sleep": sleep}
+    changes: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     name = resolve(name)
     if name == "native":
         from dipn_jax.physics import native
 
-        return native.NativeEngine(_with_timestep(native.DEFAULTS, timestep))
+        return native.NativeEngine(dataclasses.replace(native.DEFAULTS, **changes))
     if name == "mjx":
         from dipn_jax.physics import mjx
 
-        return mjx.MjxEngine(_with_timestep(mjx.DEFAULTS, timestep))
+        return mjx.MjxEngine(dataclasses.replace(mjx.DEFAULTS, **changes))
     if name == "warp":
         from dipn_jax.physics import warp
 
-        return warp.WarpEngine(_with_timestep(warp.DEFAULTS, timestep))
+        return warp.WarpEngine(dataclasses.replace(warp.DEFAULTS, **changes))
     raise UserError(f"engine {name!r}: want auto, native, mjx or warp")
-
-
-def _with_timestep(config: PhysicsConfig, timestep: float | None) -> PhysicsConfig:
-    return config if timestep is None else dataclasses.replace(config, timestep=timestep)

@@ -31,8 +31,8 @@ class Worlds(Protocol):
         """Of each kind of mjtWarning (last info, count) `[B, W, 2]`."""
         ...
 
-    def advance(self) -> np.ndarray:
-        """Simulate one control period; returns which simulations (indices) the engine gave up."""
+    def advance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate one control period; returns which simulations (indices) failed, and which ran out of memory."""
         ...
 
     def depths(self) -> np.ndarray:
@@ -65,7 +65,7 @@ def follow(
             sims.ctrl[:] = controls(trajectories, time + GRIPPER.lag)
             if fence:
                 hold_in(sims, mass, up=time < fence)
-            watch.raised(sims.advance())
+            watch.raised(*sims.advance())
             watch.tick()
     fault = watch.codes(controls(trajectories, float(samples[-1])), settle)
     rollout, hand = (np.stack(part, 1).astype(np.float32) for part in zip(*stored, strict=True))
@@ -77,11 +77,12 @@ class Watch:
 
     def __init__(self, scenes: Scene, sims: Worlds) -> None:
         self.scenes, self.sims = scenes, sims
-        self.broken = np.zeros(len(scenes.shape), bool)
+        self.broken, self.full = np.zeros((2, len(scenes.shape)), bool)
         self.top = np.zeros(len(scenes.shape))
 
-    def raised(self, ids: np.ndarray) -> None:
-        self.broken[ids] = True
+    def raised(self, failed: np.ndarray, full: np.ndarray) -> None:
+        """Note simulations that the engine gave up."""
+        self.broken[failed], self.full[full] = True, True
 
     def velocity(self) -> np.ndarray:
         """Of the objects `[B, N, 6]`."""
@@ -105,7 +106,7 @@ class Watch:
             target[:, :3],
             top=self.top,
             broken=self.broken | (warning[:, _BAD] > 0).any(-1),
-            full=(warning[:, _FULL] > 0).any(-1),
+            full=self.full | (warning[:, _FULL] > 0).any(-1),
             depth=np.where(self.broken, 0.0, self.sims.depths()),
             settle=settle,
             xp=np,
@@ -156,4 +157,5 @@ def controls(trajectories: Trajectory, time: float) -> np.ndarray:
 
 
 def gripper(qpos: np.ndarray) -> np.ndarray:
+    """The gripper `[B, 5]` as in `Rollout.gripper`, of generalized positions `[B, 6 + 7 N]`."""
     return np.concatenate([qpos[:, :4], qpos[:, 4:5] + qpos[:, 5:6]], -1)

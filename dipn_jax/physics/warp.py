@@ -66,7 +66,7 @@ class WarpEngine:
           UserError: Warp cannot be used, or the time step does not divide the control period.
         """
         self.substeps = physics.substeps(config)
-        self.config, self.chunk = config, chunk
+        self.config, self.chunk, self.batch = config, chunk, chunk
         self.stopped, self._running = threading.Event(), threading.Lock()
         self.warp, self.mujoco_warp = _load()
         self.device = self.warp.get_preferred_device()  # the first GPU, or else the CPU
@@ -152,7 +152,7 @@ class _Worlds:
         self.mjw.reset_data(self.model, self.data)
         return capture.graph
 
-    def advance(self) -> np.ndarray:
+    def advance(self) -> tuple[np.ndarray, np.ndarray]:
         """See `hosted.Worlds`; no world is given up."""
         if self.engine.stopped.is_set():
             raise physics.Stopped
@@ -164,7 +164,7 @@ class _Worlds:
             for _ in range(self.engine.substeps):
                 self.mjw.step(self.model, self.data)
         self.qpos, self.qvel = self.data.qpos.numpy().astype(float), self.data.qvel.numpy().astype(float)
-        return np.zeros(0, int)
+        return np.zeros(0, int), np.zeros(0, int)
 
     def depths(self) -> np.ndarray:
         """See `hosted.Worlds`; of the last step."""

@@ -182,6 +182,14 @@ def test_a_batch_is_shared_by_all_devices_with_equal_results(tmp_path: pathlib.P
     assert done.returncode == 0, done.stderr[-2000:]
 
 
+def test_contacts_that_are_left_out_are_a_fault() -> None:
+    cramped = MjxEngine(dataclasses.replace(mjx.DEFAULTS, contact_points=2))
+    size, flat = np.full((1, 1, 3), 0.05, np.float32), np.full((1, 1), 0.35, np.float32)
+    box = Scene(np.zeros((1, 1), np.int32), size, size, flat, flat)
+    pose = np.array([[[0, 0, 0.0249, 1, 0, 0, 0]]], np.float32)
+    assert primitives.settle(cramped, box, pose, duration=0.02).fault[0] & Fault.CAPACITY
+
+
 def test_a_timestep_that_does_not_divide_the_control_period_is_refused() -> None:
     with pytest.raises(UserError, match=r"timestep 0\.004"):
         MjxEngine(dataclasses.replace(mjx.DEFAULTS, timestep=0.004))

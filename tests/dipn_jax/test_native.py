@@ -4,10 +4,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from dipn_jax import clutter, physics, primitives, scenes, shapes, structs
+from datagen import isolated
+from dipn_jax import clutter, model, physics, primitives, scenes, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import native
 from dipn_jax.structs import Fault, Grasp, Push, Scene
@@ -114,6 +116,59 @@ def test_faults_are_data_of_their_own_episode(engine: Any, resting: Any) -> None
     assert rollout.fault[2] & Fault.PENETRATION
     assert rollout.fault[3] == 0 and rollout.fault[4] == 0
     assert Fault.count(rollout.fault)["outside"] == 1
+
+
+def test_a_spike_of_speed_and_an_object_inside_another_are_faults(engine: Any, resting: Any) -> None:
+    scene, poses = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 3, 0), resting)
+    cubes = scene.replace(shape=np.zeros((3, 2), np.int32))
+    above, inside, beside = [0.15, 0, 2.0], [0.04, 0, 0], [0.06, 0, 0]  # a fall of 2 m ends at 6 m/s
+    poses[:, 1] = poses[:, 0]
+    poses[:, 1, :3] += np.array([above, inside, beside], np.float32)
+    fallen = primitives.settle(engine, cubes, poses, duration=0.6)
+    assert [bool(f & Fault.SPEED) for f in fallen.fault] == [True, False, False]
+    at_once = primitives.settle(engine, cubes, poses, duration=0.0)
+    assert [bool(f & Fault.PENETRATION) for f in at_once.fault] == [False, True, False]
+
+
+def test_lack_of_room_is_a_fault(engine: Any, resting: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, poses = resting
+    original = model.mjcf
+    monkeypatch.setattr(
+        model, "mjcf", lambda *a, **k: original(*a, **k).replace("<custom>", '<size memory="8K"/><custom>')
+    )
+    cramped = primitives.settle(native.NativeEngine(), scene, poses, duration=0.05)
+    assert (cramped.fault == Fault.CAPACITY).all()
+
+
+def test_a_diverged_simulation_is_not_reset_behind_our_back(resting: Any) -> None:
+    scene, _ = resting
+    text = model.mjcf(structs.take(scene, 0), config=model.PhysicsConfig())
+    spec = mujoco.MjModel.from_xml_string(text)
+    assert spec.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
+
+
+def test_a_grasp_that_cannot_hold_does_not(engine: Any, rng: np.random.Generator) -> None:
+    assert isolated.share_of_wrong_held(engine, rng, 4) == (0.0, 0.0)
+
+
+def test_every_item_that_fits_is_held(engine: Any, rng: np.random.Generator) -> None:
+    for item in shapes.CATALOGUE[::4]:
+        share, tries = isolated.share_held(engine, rng, item, 4)
+        assert share >= 0.75 and tries == 4, item
+
+
+def test_two_objects_side_by_side_are_both_held(engine: Any) -> None:
+    size = np.full((1, 3, 3), 0.05, np.float32)
+    size[..., 0] = 0.025
+    flat = np.full((1, 3), 0.35, np.float32)
+    scene = Scene(np.zeros((1, 3), np.int32), size, np.zeros_like(size), flat / 7, flat)
+    poses = np.zeros((1, 3, 7), np.float32)
+    poses[..., :3] = [[[-0.013, 0, 0.025], [0.013, 0, 0.025], [0.15, 0, 0.025]]]
+    poses[..., 3] = 1
+    _, outcome = primitives.grasp(
+        engine, scene, poses, Grasp(np.zeros((1, 2), np.float32), np.zeros(1, np.float32), np.full(1, 0.02, np.float32))
+    )
+    np.testing.assert_array_equal(outcome.held, [[True, True, False]])
 
 
 def test_a_gripper_that_is_stopped_says_so(engine: Any, resting: Any) -> None:
