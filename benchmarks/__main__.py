@@ -1,0 +1,100 @@
+"""`python -m benchmarks NAME ...`: one line `name value` a figure, and a JSON file of all with `--out`."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import sys
+from collections.abc import Sequence
+
+from benchmarks.harness import Benchmark, Figures, Setting, Skipped, machine
+from dipn_jax import console, files
+from dipn_jax.errors import UserError
+
+BENCHMARKS = {
+    "datagen_native.share_of_bare": Benchmark(
+        "push episodes on disk a second over what bare MuJoCo steps allow", ">= 0.90", "datagen_native:share_of_bare"
+    ),
+    "datagen_native.grasp_share_of_bare": Benchmark(
+        "grasp episodes on disk a second over what bare MuJoCo steps allow",
+        ">= 0.90",
+        "datagen_native:grasp_share_of_bare",
+    ),
+    "datagen_native.vs_pybullet": Benchmark(
+        "drop-and-push episodes a second over PyBullet's", ">= 3", "bullet:vs_pybullet"
+    ),
+    "datagen_mjx.vs_naive": Benchmark(
+        "steps a second of the MJX engine over a loop of jitted mjx.step", ">= 2", "datagen_mjx:vs_naive"
+    ),
+    "datagen_mjx.batch_scaling": Benchmark(
+        "cost of a scene's step at batch 128 over that at batch 16", "<= 1.0", "datagen_mjx:batch_scaling"
+    ),
+    "render.vs_raycast": Benchmark("images a second over MuJoCo's ray caster", ">= 20", "rendering:vs_raycast"),
+    "storage.vs_images": Benchmark("bytes of a push over PNGs of its frames", "<= 0.01", "storage:vs_images"),
+    "compile.warm_over_cold": Benchmark(
+        "first calls with a warm compilation cache over a cold one", "<= 0.3", "compilation:warm_over_cold"
+    ),
+    "rates": Benchmark("episodes a second of each engine, 1 to 30 objects", "none", "rates:rates"),
+}
+
+
+def chosen(names: Sequence[str]) -> list[str]:
+    """The benchmarks that `names` stand for.
+
+    Raises:
+      UserError: one of them is none.
+    """
+    unknown = [name for name in names if name not in (*BENCHMARKS, "all")]
+    if unknown:
+        raise UserError(f"benchmark {unknown[0]}: no such name; choose from {', '.join(BENCHMARKS)} or all")
+    return list(BENCHMARKS) if "all" in names else list(dict.fromkeys(names))
+
+
+def measure(names: Sequence[str], setting: Setting, out: pathlib.Path | None) -> Figures:
+    """Run `chosen(names)`; figures are printed, and written to `out`, as they come.
+
+    Raises:
+      UserError: a benchmark that was asked for by name cannot run here.
+    """
+    figures: Figures = {}
+    facts = machine() | {"seed": setting.seed, "scale": setting.scale}
+    for name in chosen(names):
+        try:
+            for figure, value in BENCHMARKS[name].load()(setting):
+                figures[figure] = value
+                console.say(f"{figure} {value:.4g}")
+                if out:
+                    files.write_json(out, {"figures": figures, "machine": facts})
+        except Skipped as reason:
+            if "all" not in names:
+                raise UserError(f"{name}: {reason}") from None
+            print(f"{name}: skipped: {reason}", file=sys.stderr, flush=True)
+    return figures
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks, or all; none: list them")
+    parser.add_argument("--out", type=pathlib.Path, metavar="FILE.json", help="write figures and machine as JSON")
+    parser.add_argument("--scale", choices=("small", "full"), default="small", help="amount of work (default: small)")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+    options = parser.parse_args(arguments)
+    if not options.names:
+        for name, benchmark in BENCHMARKS.items():
+            console.say(f"{name:36} {benchmark.what} (goal: {benchmark.goal})")
+        return 0
+    console.enable_compilation_cache()
+    try:
+        console.require_seed(options.seed)
+        if options.out:
+            console.require_out(options.out.parent)
+        measure(options.names, Setting(options.scale, options.seed), options.out)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

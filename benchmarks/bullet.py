@@ -1,0 +1,147 @@
+"""Drop and push on MuJoCo C, as the project does it, against the same in PyBullet with one process a core."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import multiprocessing
+from collections.abc import Iterator
+from multiprocessing.pool import Pool
+
+import jax
+import mujoco
+import numpy as np
+
+from benchmarks import bullet_worker
+from benchmarks.bullet_worker import CONTROL_PERIOD, Settings, Work
+from benchmarks.harness import Setting, Skipped, alternate, cores, make_data
+from datagen.generate import Job
+from dipn_jax import clutter, model, primitives, scenes, shapes, structs
+from dipn_jax.physics import make_engine
+from dipn_jax.structs import Push, Scene, SettledScene
+from dipn_jax.workspace import GRIPPER
+
+OBJECTS = 7
+ITEMS = tuple(item.name for item in shapes.CATALOGUE if item.shape != "concave")
+"""One convex part each, which PyBullet takes as they are."""
+LADDER = (Settings(1 / 240, 50), Settings(1 / 480, 50), Settings(1 / 480, 100), Settings(1 / 960, 100))
+"""From cheap to exact; a time step of 1/240 s and 50 iterations are PyBullet's own."""
+SAME_STEP = LADDER[1]
+"""About the time step of our own engine (2 ms)."""
+LIKE = 1.25
+"""Median depth of contacts at rest, over ours, up to which PyBullet's settings count as like."""
+STANDOFF = 0.09
+"""Metres from the middle of an object at which a push comes down."""
+
+
+def config() -> scenes.SceneConfig:
+    """Scenes of both sides."""
+    return scenes.fixed_count(OBJECTS, ranges=scenes.Ranges(items=ITEMS))
+
+
+def _drawn(seed: int, count: int) -> tuple[Scene, np.ndarray]:
+    """Scenes `[count]` in mid-air, as numpy."""
+    draw = jax.jit(jax.vmap(lambda key: scenes.random_scene(key, config=config())))
+    return jax.tree.map(np.asarray, draw(jax.random.split(jax.random.key(seed), count)))
+
+
+def _paths(rng: np.random.Generator, count: int) -> np.ndarray:
+    """The gripper's middle and yaw `[count, T, 4]`, one a control period, through the middle of the pushed object."""
+    angle = rng.uniform(-np.pi, np.pi, count).astype(np.float32)
+    toward = np.stack([np.cos(angle), np.sin(angle)], -1)
+    trajectory = primitives.push_trajectory(
+        Push(-np.float32(STANDOFF) * toward, angle, np.full(count, 0.1, np.float32))
+    )
+    times, targets = np.asarray(trajectory.time), np.asarray(trajectory.target)
+    ticks = np.arange(0.0, primitives.push_samples()[-1], CONTROL_PERIOD)
+    paths = [[np.interp(ticks, times[i], targets[i, :, axis]) for axis in range(4)] for i in range(count)]
+    middle = np.array([0.0, 0.0, GRIPPER.finger_length / 2, 0.0])
+    return np.swapaxes(np.array(paths), 1, 2) + middle
+
+
+def works(seed: int, count: int, settings: Settings) -> list[Work]:
+    """`count` episodes, shared out to all cores in pieces."""
+    scene, poses = _drawn(seed, count)
+    rng = np.random.default_rng(seed)
+    paths, aimed = _paths(rng, count), rng.integers(OBJECTS, size=count)
+    spread = shapes.UNIT_VARIANCE[scene.shape] * scene.size**2
+    inertia = scene.mass[..., None] * (spread.sum(-1, keepdims=True) - spread)
+    boxes = scene.shape == shapes.CLASSES.index("cuboid")
+    half = (GRIPPER.push_width / 2, GRIPPER.pad_width / 2, GRIPPER.finger_length / 2)
+    moved = GRIPPER.mass + 2 * GRIPPER.finger_mass
+    pieces = []
+    for rows in np.array_split(np.arange(count), min(count, 4 * cores())):
+        piece = Work(
+            settings=settings,
+            vertices=[[_corners(scene, i, slot) for slot in range(OBJECTS)] for i in rows],
+            boxes=boxes[rows],
+            size=scene.size[rows],
+            mass=scene.mass[rows],
+            inertia=inertia[rows],
+            friction=scene.friction[rows],
+            poses=poses[rows],
+            aimed=aimed[rows],
+            paths=paths[rows],
+            gripper=half,
+            gripper_mass=moved,
+            settle_time=primitives.SETTLE_TIME,
+        )
+        pieces.append(piece)
+    return pieces
+
+
+def _corners(scene: Scene, index: int, slot: int) -> np.ndarray:
+    """Distinct corners `[K, 3]` of a convex object."""
+    return np.unique(shapes.UNIT_VERTICES[scene.shape[index, slot], 0], axis=0) * scene.size[index, slot]
+
+
+def our_depth(items: SettledScene) -> float:
+    """Median depth (metres) of contacts at rest in the native engine."""
+    depths = []
+    for i in range(len(items.fault)):
+        text = model.mjcf(structs.take(items.scene, i), config=model.PhysicsConfig())
+        compiled = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(compiled)
+        data.qpos[2] = 2.0  # the gripper is away
+        data.qpos[model.GRIPPER_DOF :] = np.asarray(items.poses[i]).reshape(-1)
+        mujoco.mj_forward(compiled, data)
+        depths.append(-data.contact.dist[data.contact.dist < 0])
+    return float(np.median(np.concatenate(depths)))
+
+
+def like(pool: Pool, seed: int, count: int, limit: float) -> tuple[Settings, float]:
+    """The cheapest settings of the ladder that sink no deeper than `limit` metres (else the last), and how deep."""
+    depth = np.inf
+    for settings in LADDER:
+        made = pool.map(bullet_worker.episodes, works(seed, count, settings), chunksize=1)
+        depth = float(np.median(np.concatenate([depths for _, depths in made])))
+        if depth <= limit:
+            break
+    return settings, depth
+
+
+def vs_pybullet(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Episodes a second over PyBullet's, and how deep objects sink in either.
+
+    One push on each dropped scene on both sides. PyBullet is spared what costs us: it looks for no push, throws no
+    episode away and writes none to disk.
+    """
+    if importlib.util.find_spec("pybullet") is None:
+        raise Skipped("PyBullet is not installed; run pip install pybullet (the extra `bench`)")
+    count = setting.pick(48, 480)
+    job = Job("push", config(), count, setting.seed, -(-count // 4), 1, "native")
+    items = clutter.settled_exactly(jax.random.key(setting.seed), make_engine("native"), config(), 32)
+    depth = our_depth(items)
+    make_data(job)  # compiles
+    with multiprocessing.get_context("spawn").Pool(cores()) as pool:
+        pool.map(bullet_worker.ready, range(cores()), chunksize=1)
+        settings, theirs_depth = like(pool, setting.seed + 1, 8 * cores(), LIKE * depth)
+        for name, chosen in (("", settings), ("/same_step", SAME_STEP)):
+            work = works(setting.seed, count, chosen)
+            theirs = functools.partial(pool.map, bullet_worker.episodes, work, chunksize=1)
+            mine, other = alternate(lambda: make_data(job), theirs, repeats=setting.pick(2, 3))
+            yield f"datagen_native.vs_pybullet{name}", other / mine
+    yield "datagen_native.vs_pybullet/depth_mm", 1000 * depth
+    yield "datagen_native.vs_pybullet/pybullet_depth_mm", 1000 * theirs_depth
+    yield "datagen_native.vs_pybullet/pybullet_steps_per_second", 1 / settings.timestep
+    yield "datagen_native.vs_pybullet/pybullet_iterations", settings.iterations

@@ -1,0 +1,125 @@
+"""The MJX engine against stepping MJX as its manual shows, and against itself at another batch size."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+from xml.etree import ElementTree
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from benchmarks.harness import Setting, alternate
+from dipn_jax import geometry, model, primitives, scenes, structs
+from dipn_jax.model import GRIPPER_DOF
+from dipn_jax.physics import make_engine, substeps
+from dipn_jax.physics.mjx import MjxEngine
+from dipn_jax.structs import Scene
+
+OBJECTS = 7
+FALL = 0.5
+"""Seconds for which objects have fallen when the clock starts: a heap that still moves."""
+
+
+@functools.cache
+def engine() -> MjxEngine:
+    """One for all benchmarks: it keeps its compiled programs."""
+    made = make_engine("mjx")
+    assert isinstance(made, MjxEngine)
+    return made
+
+
+def heaps(seed: int, batch: int) -> tuple[Scene, np.ndarray]:
+    """One random scene `batch` times, and poses `[batch, N, 7]` of a different heap of it in each."""
+    key = jax.random.key(seed)
+    scene, poses = scenes.random_scene(key, config=scenes.fixed_count(OBJECTS))
+    repeated = structs.take(jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene), np.zeros(batch, int))
+    start = np.tile(np.asarray(poses), (batch, 1, 1))
+    # objects start between the bounding spheres of one another, so they may be turned at will
+    start[..., 3:] = np.asarray(geometry.random_quat(jax.random.fold_in(key, 1), shape=(batch, OBJECTS)))
+    rollout = primitives.settle(make_engine("native"), repeated, start, duration=FALL)
+    return repeated, np.asarray(rollout.poses)[:, -1]
+
+
+def plain_mjcf(scene: Scene, config: model.PhysicsConfig) -> str:
+    """The world of one scene without the geoms that only keep layouts alike."""
+    root = ElementTree.fromstring(model.mjcf(scene, config=config))
+    gone = {geom.get("name") for geom in root.iter("geom") if geom.get("contype") == "8"}
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag == "geom" and child.get("name") in gone:
+                parent.remove(child)
+            if child.tag == "pair" and {child.get("geom1"), child.get("geom2")} & gone:
+                parent.remove(child)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+class Naive:
+    """`jax.vmap(mjx.step)`, jitted, in a Python loop; contacts as they come."""
+
+    def __init__(self, scene: Scene, poses: np.ndarray, config: model.PhysicsConfig) -> None:
+        """Compile for the scene `scene [B]` (the same in every row) from `poses [B, N, 7]`."""
+        config = dataclasses.replace(config, geom_pairs=-1, contact_points=-1)
+        compiled = mujoco.MjModel.from_xml_string(plain_mjcf(structs.take(scene, 0), config))
+        self.model = mjx.put_model(compiled, impl="jax")
+        still = primitives.parked_trajectory(1, 1.0).target[0, 0]
+        control = jnp.concatenate([still[:4], still[4:] / 2, still[4:] / 2])
+        first = mjx.make_data(self.model)
+        qpos = jnp.asarray(poses, jnp.float32).reshape(len(poses), -1)
+        qpos = jnp.concatenate([jnp.broadcast_to(control, (len(poses), GRIPPER_DOF)), qpos], -1)
+        first = first.replace(ctrl=control)
+        self.first = jax.vmap(lambda q: first.replace(qpos=q))(qpos)
+        self.first = jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), self.first)
+        self.step = jax.jit(self._step)
+        self.last = self.run(2)
+
+    @staticmethod
+    def _step(m: Any, data: Any) -> Any:
+        """One step of all scenes; weak types, of which MJX returns some, would make the second call compile again."""
+        new = jax.vmap(mjx.step, in_axes=(None, 0))(m, data)
+        return jax.tree.map(lambda leaf, old: jnp.asarray(leaf).astype(old.dtype), new, data)
+
+    def run(self, steps: int) -> Any:
+        """Step from the beginning."""
+        data = self.first
+        for _ in range(steps):
+            data = self.step(self.model, data)
+        self.last = jax.block_until_ready(data)
+        return self.last
+
+
+def ours(scene: Scene, poses: np.ndarray, duration: float) -> Callable[[], Any]:
+    """Work: the engine's own program for `duration` seconds."""
+    still, end = primitives.parked_trajectory(len(poses), duration), np.array([duration])
+    return lambda: engine().simulate(scene, poses, still, end)
+
+
+def vs_naive(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of the loop over seconds of the engine, as many steps of the same scenes."""
+    duration = setting.pick(10, 30) / 100
+    config = engine().config
+    steps = round(duration / 0.01) * substeps(config)
+    for batch in (32, 128):
+        scene, poses = heaps(setting.seed, batch)
+        work = ours(scene, poses, duration)
+        work()  # compiles
+        with jax.numpy_rank_promotion("allow"):
+            naive = Naive(scene, poses, config)
+            mine, theirs = alternate(work, functools.partial(naive.run, steps), repeats=setting.pick(3, 5))
+        if not np.isfinite(np.asarray(naive.last.qpos)).all():
+            raise RuntimeError("the naive loop diverged: its time means nothing; try another --seed")
+        yield f"datagen_mjx.vs_naive/{batch}", theirs / mine
+
+
+def batch_scaling(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Cost of a step of one scene in a batch of 128 over that in one of 16."""
+    duration = setting.pick(10, 30) / 100
+    few, many = (ours(*heaps(setting.seed, batch), duration) for batch in (16, 128))
+    few(), many()  # compile
+    small, large = alternate(few, many, repeats=setting.pick(3, 7))
+    yield "datagen_mjx.batch_scaling", (large / 128) / (small / 16)

@@ -1,0 +1,123 @@
+"""Data generation on MuJoCo C against the bare steps inside it, bit for bit the same ones."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from mujoco import batch as mujoco_batch
+
+from benchmarks.harness import Setting, alternate, make_data
+from datagen.generate import Job
+from dipn_jax import scenes
+from dipn_jax.physics import native
+
+ACTIONS = {"push": 3, "grasp": 6}
+"""Actions tried on one scene: what the commands do unasked."""
+SHARDS = 4
+INPUTS = ("ctrl", "qfrc_applied")
+"""What the engine sets between steps."""
+
+
+@dataclasses.dataclass
+class Tape:
+    """One batch of simulations: how it began, what was set before each call of `step`, how it ended."""
+
+    models: list[Any]
+    nthread: int
+    start: np.ndarray | None = None  # [B, nq]
+    calls: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = dataclasses.field(default_factory=list)
+    end: np.ndarray | None = None  # [B, nq]
+
+
+@contextlib.contextmanager
+def recording() -> Iterator[list[Tape]]:
+    """Within it, the native engine keeps a tape of every batch it simulates."""
+    tapes: list[Tape] = []
+
+    class Recorder(native._Worlds):
+        def __init__(self, models: list[Any], engine: native.NativeEngine) -> None:
+            super().__init__(models, engine)
+            self._tape = Tape(models, engine.threads)
+            tapes.append(self._tape)
+
+        def step(self, **options: Any) -> None:
+            tape = self._tape
+            if tape.start is None:
+                tape.start = np.array(self.qpos)
+            tape.calls.append(({name: np.array(getattr(self, name)) for name in INPUTS}, options))
+            try:
+                super().step(**options)
+            finally:
+                tape.end = np.array(self.qpos)
+
+    with mock.patch.object(native, "_Worlds", Recorder):
+        yield tapes
+
+
+class Replay:
+    """A tape made ready to be stepped again, with nothing else in between."""
+
+    def __init__(self, tape: Tape) -> None:
+        self.tape = tape
+        self.sims = mujoco_batch.Batch(tape.models[0], nsim=len(tape.models), nthread=tape.nthread, persistent=True)
+        self.sims.set_models(tape.models)
+        self.sims.qpos[:] = tape.start
+        self.inputs = {name: getattr(self.sims, name) for name in INPUTS}
+
+    def run(self) -> None:
+        """The bare steps."""
+        for values, options in self.tape.calls:
+            for name, value in values.items():
+                self.inputs[name][:] = value
+            with contextlib.suppress(mujoco_batch.SimulationError):  # a diverged one stops, as it did when recorded
+                self.sims.step(**options)
+
+    def check(self) -> None:
+        """That the same states were passed.
+
+        Raises:
+          RuntimeError: they were not, so the two times do not belong together.
+        """
+        if not np.array_equal(np.asarray(self.sims.qpos), self.tape.end, equal_nan=True):  # type: ignore[arg-type]
+            raise RuntimeError("the bare steps end elsewhere: the engine sets more than datagen_native.INPUTS")
+
+
+def share(setting: Setting, kind: str, objects: int) -> float:
+    """Seconds of the bare steps over seconds of the data set that they were recorded in."""
+    size = setting.pick(96, 480)
+    job = Job(kind, scenes.fixed_count(objects), SHARDS * size, setting.seed, size, ACTIONS[kind], "native")
+    with recording() as tapes:  # also compiles what JAX has to
+        make_data(job)
+    tapes = [tape for tape in tapes if tape.start is not None]
+    ready: list[list[Replay]] = []
+
+    def prepare() -> None:
+        ready.append([Replay(tape) for tape in tapes])
+
+    def bare() -> None:
+        for replay in ready[-1]:
+            replay.run()
+
+    times = []
+    for _ in range(setting.pick(3, 5)):
+        prepare()
+        times.append(alternate(bare, lambda: make_data(job), repeats=1))
+        for replay in ready.pop():
+            replay.check()
+    return sum(first for first, _ in times) / sum(second for _, second in times)
+
+
+def share_of_bare(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Pushes on disk a second over what the engine's steps alone would allow."""
+    for objects in (7, 10):
+        yield f"datagen_native.share_of_bare/{objects}", share(setting, "push", objects)
+
+
+def grasp_share_of_bare(setting: Setting) -> Iterator[tuple[str, float]]:
+    """The same for grasps."""
+    yield "datagen_native.grasp_share_of_bare/10", share(setting, "grasp", 10)

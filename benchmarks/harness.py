@@ -1,0 +1,126 @@
+"""What all benchmarks share: scales, alternating clocks, quiet data sets, facts about the machine."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import os
+import pathlib
+import platform
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+from datagen import generate
+from dipn_jax import files
+
+Figures = dict[str, float]
+Scale = Literal["small", "full"]
+
+
+class Skipped(Exception):
+    """A benchmark cannot run here; the message is one line that says what is missing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What a run of benchmarks is a function of."""
+
+    scale: Scale
+    seed: int
+
+    def pick(self, small: int, full: int) -> int:
+        """The amount for this scale."""
+        return small if self.scale == "small" else full
+
+
+@dataclasses.dataclass(frozen=True)
+class Benchmark:
+    """One name of the command line."""
+
+    what: str
+    goal: str
+    place: str  # module:function
+
+    def load(self) -> Callable[[Setting], Iterator[tuple[str, float]]]:
+        """The function; what packages say while they are imported is kept off the terminal."""
+        module, _, function = self.place.partition(":")
+        with quiet():
+            return getattr(importlib.import_module(f"benchmarks.{module}"), function)
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    """Wall-clock seconds that `work` takes."""
+    begun = time.perf_counter()
+    work()
+    return time.perf_counter() - begun
+
+
+def alternate(first: Callable[[], Any], second: Callable[[], Any], *, repeats: int) -> tuple[float, float]:
+    """Median seconds of two pieces of work, run in turns so that both meet the same state of the machine.
+
+    Args:
+      first: some work.
+      second: other work.
+      repeats: runs of each; who begins changes from pair to pair.
+    """
+    times: tuple[list[float], list[float]] = ([], [])
+    for repeat in range(repeats):
+        for which in (0, 1) if repeat % 2 == 0 else (1, 0):
+            times[which].append(seconds((first, second)[which]))
+    return statistics.median(times[0]), statistics.median(times[1])
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what the commands say about their progress off the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        yield
+
+
+def make_data(job: generate.Job) -> int:
+    """Write the data set of `job` in a temporary folder; returns the bytes of its files."""
+    with tempfile.TemporaryDirectory() as name, quiet():
+        folder = pathlib.Path(name) / "data"
+        generate.generate(job, folder)
+        return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def machine() -> dict[str, Any]:
+    """Processor, accelerator, versions and commit: what figures are to be read with."""
+    import jax
+
+    return {
+        "processor": _processor(),
+        "cores": cores(),
+        "devices": [device.device_kind for device in jax.local_devices()],
+        "python": platform.python_version(),
+        "versions": files.package_versions(),
+        "commit": _commit(),
+    }
+
+
+def _processor() -> str:
+    info = pathlib.Path("/proc/cpuinfo")
+    rows = info.read_text().splitlines() if info.exists() else []
+    names = (row.partition(":")[2].strip() for row in rows if row.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def _commit() -> str:
+    """Commit of the sources, marked where files differ from it."""
+    command = ["git", "-C", str(pathlib.Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

@@ -1,0 +1,83 @@
+"""The renderer against MuJoCo's ray caster: the same images of the same scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import jax
+import mujoco
+import numpy as np
+from mujoco import batch as mujoco_batch
+
+from benchmarks.harness import Setting, alternate, cores
+from dipn_jax import clutter, model, render, scenes, structs
+from dipn_jax.physics import make_engine
+from dipn_jax.structs import ABSENT, Observation, Scene, SettledScene
+from dipn_jax.workspace import WORKSPACE
+
+OBJECTS, BATCH = 10, 16
+CAMERA = 1.0
+"""Metres above the table from which rays start."""
+AWAY = 3.0
+"""Metres above the table to which the gripper is lifted out of the view."""
+LABELS_EQUAL = 0.999
+"""Least share of pixels on which both must agree for their times to be compared."""
+
+
+class RayCaster:
+    """RGB, height and labels by one vertical ray a pixel.
+
+    `mj_multiRay` sends all rays from one point, so an orthographic view needs `Batch.ray`, which spreads scenes
+    over all cores.
+    """
+
+    def __init__(self, items: SettledScene) -> None:
+        """Everything that can be made ready before the rays."""
+        library = model.mesh_library(items.scene)
+        texts = [model.mjcf(structs.take(items.scene, i), config=model.PhysicsConfig(), library=library)
+                 for i in range(len(items.fault))]  # fmt: skip
+        models = [mujoco.MjModel.from_xml_string(text) for text in texts]
+        self.sims = mujoco_batch.Batch(models[0], nsim=len(models), nthread=cores())
+        self.sims.set_models(models)
+        self.sims.qpos[:, 2] = AWAY
+        self.sims.qpos[:, model.GRIPPER_DOF :] = np.asarray(items.poses).reshape(len(models), -1)
+        self.slot = models[0].geom_bodyid - models[0].body("o0").id  # of each geom; negative: no object
+        at = (np.arange(WORKSPACE.pixels) - (WORKSPACE.pixels - 1) / 2) * WORKSPACE.pixel
+        x, y = np.meshgrid(at, at)
+        self.origin = np.stack([x, y, np.full_like(x, CAMERA)], -1).reshape(-1, 3)
+        table = np.broadcast_to(render.TABLE_COLOR, (len(models), 1, 3))
+        self.palette = np.concatenate([np.asarray(items.scene.color), table], 1)
+
+    def observe(self) -> Observation:
+        """As `clutter.observe`, numpy."""
+        side = WORKSPACE.pixels
+        distance, geom = self.sims.ray(self.origin, np.array([0.0, 0.0, -1.0]))
+        slot = np.where(geom < 0, ABSENT, self.slot[geom])
+        label = np.where(slot < 0, ABSENT, slot).reshape(-1, side, side)
+        height = np.where(label < 0, 0.0, CAMERA - distance.reshape(label.shape))
+        color = self.palette[np.arange(len(label))[:, None, None], label]  # ABSENT is the last: the table
+        return Observation(height.astype(np.float32), color.astype(np.float32), label.astype(np.int32))
+
+
+def _same(ours: Observation, theirs: Observation) -> None:
+    equal = float((np.asarray(ours.label) == theirs.label).mean())
+    if equal < LABELS_EQUAL:
+        raise RuntimeError(f"labels of renderer and ray caster agree on {equal:.4f} of all pixels: not the same images")
+
+
+def vs_raycast(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of the ray caster over seconds of the renderer."""
+    key = jax.random.key(setting.seed)
+    items = clutter.settled_exactly(key, make_engine("native"), scenes.fixed_count(OBJECTS), BATCH)
+    caster = RayCaster(items)
+    scene: Scene = jax.tree.map(jax.numpy.asarray, items.scene)
+    poses = jax.numpy.asarray(items.poses)
+    _same(clutter.observe(scene, poses), caster.observe())  # also compiles
+    inner = 10  # images take a thousandth of a second each
+
+    def ours() -> None:
+        for _ in range(inner):
+            jax.block_until_ready(clutter.observe(scene, poses))
+
+    mine, theirs = alternate(ours, caster.observe, repeats=setting.pick(5, 15))
+    yield "render.vs_raycast", theirs / (mine / inner)

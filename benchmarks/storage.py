@@ -1,0 +1,58 @@
+"""An episode on disk against the images that it stands for."""
+
+from __future__ import annotations
+
+import pathlib
+import tempfile
+from collections.abc import Iterator
+
+import cv2
+import jax
+import numpy as np
+
+from benchmarks.harness import Setting, quiet
+from datagen.generate import Job, generate
+from dipn_jax import clutter, records, scenes, structs
+from dipn_jax.structs import Observation, PushEpisode
+
+OBJECTS = 10
+DEPTH_UNIT = 1e-4
+"""Metres of one step of a 16-bit depth image."""
+
+
+def png_bytes(seen: Observation) -> int:
+    """Bytes of colour and depth of observations `[B]` as PNGs."""
+    total = 0
+    for color, height in zip(np.asarray(seen.color), np.asarray(seen.height), strict=True):
+        eight = np.rint(color[..., ::-1] * 255).astype(np.uint8)
+        sixteen = np.rint(np.maximum(height, 0.0) / DEPTH_UNIT).astype(np.uint16)
+        for image in (eight, sixteen):
+            fine, code = cv2.imencode(".png", image)
+            assert fine
+            total += code.size
+    return total
+
+
+def image_bytes(episodes: PushEpisode, count: int) -> float:
+    """Mean bytes of the frames of an episode, from `count` of them."""
+    frames = np.asarray(episodes.poses).shape[1]
+    total = 0
+    for i in np.linspace(0, len(episodes.fault) - 1, count).astype(int):
+        poses = np.asarray(episodes.poses)[i]
+        repeated = structs.take(episodes.scene, np.full(frames, i))
+        total += png_bytes(clutter.observe(repeated, poses))
+    return total / count
+
+
+def vs_images(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Bytes of a push episode, its share of the metadata included, over those of its images."""
+    episodes = setting.pick(200, 1000)
+    job = Job("push", scenes.fixed_count(OBJECTS), episodes, setting.seed, min(episodes, 500), 3, "native")
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name) / "data"
+        with quiet():
+            generate(job, folder)
+        whole = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        made = records.read_shard(records.shard_path(folder, 0), kind="push")
+    made = jax.tree.map(np.asarray, made)
+    yield "storage.vs_images", whole / episodes / image_bytes(made, setting.pick(20, 100))
