@@ -74,9 +74,9 @@ def test_the_wrong_kind_a_missing_and_an_old_data_set_are_named(copy: pathlib.Pa
 
 def test_another_schema_version_is_named(copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records, "SCHEMA_VERSION", 99)
-    with pytest.raises(UserError, match="schema version 1, want 99"):
+    with pytest.raises(UserError, match="schema version 2, want 99"):
         records.read_shard(records.shard_path(copy, 0), kind="push")
-    with pytest.raises(UserError, match="schema version 1, want 99"):
+    with pytest.raises(UserError, match="schema version 2, want 99"):
         records.repair(copy)
     assert records.shard_path(copy, 0).exists(), "what is only old is not set aside"
 

@@ -1,0 +1,73 @@
+"""Episodes' numbers as whole multiples of a quantum, so that a file holds what a measurement could tell and no noise.
+
+Poses of a push are kept as changes from centimetre to centimetre, and poses after an action as changes from those
+before: most objects do not move, and zeros take no room. A decoded value is within half a quantum.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+QUANTA = {
+    "poses": 1e-6,  # metres, and components of quaternions
+    "after": 1e-6,
+    "scene.size": 1e-6,
+    "scene.mass": 1e-6,  # kg
+    "scene.friction": 1e-5,
+    "scene.color": 1 / 2550,  # tenths of an 8-bit step
+    "push.start": 1e-6,
+    "push.angle": 1e-6,  # radians
+    "push.distance": 1e-6,
+    "grasp.center": 1e-6,
+    "grasp.angle": 1e-6,
+    "grasp.height": 1e-6,
+}
+Columns = dict[str, np.ndarray]
+
+
+def encode(columns: Columns) -> tuple[Columns, dict[str, dict[str, Any]]]:
+    """Columns `[B, ...]` as they are stored, and what decoding them takes.
+
+    Args:
+      columns: as in `structs`, by dotted name.
+
+    Returns:
+      Columns of the same names and shapes, quantized ones as int32; and for each of these the keys `quantum` and
+      `code`: `value`, `delta` (differences along the second axis) or `from poses` (from the last of `poses`).
+
+    Raises:
+      ValueError: a value to quantize is not finite.
+    """
+    stored, specs = dict(columns), {}
+    for name, quantum in QUANTA.items():
+        if name not in columns:
+            continue
+        if not np.isfinite(columns[name]).all():
+            raise ValueError(f"column {name}: not finite")
+        stored[name] = np.rint(columns[name].astype(np.float64) / quantum).astype(np.int64)
+        specs[name] = {"quantum": quantum, "code": "value"}
+    if "after" in stored and "poses" in stored:
+        stored["after"] = stored["after"] - _last(stored["poses"], stored["after"])
+        specs["after"]["code"] = "from poses"
+    if "poses" in stored and columns["poses"].ndim == 4:
+        stored["poses"] = np.diff(stored["poses"], axis=1, prepend=0)
+        specs["poses"]["code"] = "delta"
+    return {k: v.astype(np.int32) if k in specs else v for k, v in stored.items()}, specs
+
+
+def _last(poses: np.ndarray, after: np.ndarray) -> np.ndarray:
+    return poses[:, -1] if poses.ndim > after.ndim else poses
+
+
+def decode(stored: Columns, specs: dict[str, dict[str, Any]]) -> Columns:
+    """Inverse of `encode`; quantized columns come back as float32."""
+    columns = {name: value.astype(np.int64) if name in specs else value for name, value in stored.items()}
+    if specs.get("poses", {}).get("code") == "delta":
+        columns["poses"] = np.cumsum(columns["poses"], axis=1)
+    if specs.get("after", {}).get("code") == "from poses":
+        columns["after"] = columns["after"] + _last(columns["poses"], columns["after"])
+    for name, spec in specs.items():
+        columns[name] = (columns[name] * spec["quantum"]).astype(np.float32)
+    return columns
