@@ -128,7 +128,7 @@ def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> t
     scenes, poses = jax.tree.map(np.asarray, scenes), np.asarray(poses)
     library = model.mesh_library(scenes)
     models = [
-        mujoco.MjModel.from_xml_string(model.mjcf(structs.take(scenes, i), config=DEFAULTS, library=library))
+        mujoco.MjModel.from_xml_string(model.mjcf(structs.take(scenes, i), config=PhysicsConfig(), library=library))
         for i in range(len(poses))
     ]
     sims = mujoco_batch.Batch(models[0], nsim=len(models))
