@@ -1,10 +1,11 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html (15 minutes on 2 cores)
 # make test   lint, types, tests
+# make bench  the figures of docs/benchmarks.md
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: setup demo test lint clean-demo
+.PHONY: setup demo test lint bench clean-demo
 
 setup: .venv/.installed
 
@@ -33,6 +34,11 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# ratios, and episodes a second on this machine, for docs/benchmarks.md (30 minutes on 2 idle cores)
+bench: setup
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'
+	$(BIN)/python -m benchmarks all --scale full --out benchmarks.json
 
 clean-demo:
 	rm -rf $(DEMO)
