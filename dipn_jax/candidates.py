@@ -36,20 +36,19 @@ def mask_centers(label: jax.Array, slots: int) -> tuple[jax.Array, jax.Array]:
       centroid of an object out of sight is 0.
     """
     h, w = label.shape
-    hot = (label.reshape(1, -1) == jnp.arange(slots)[:, None]).astype(jnp.float32)
-    grid = (geometry.view_grid(h, w) - jnp.array([(w - 1) / 2, (h - 1) / 2])) * WORKSPACE.pixel
-    area = hot.sum(-1)
-    center = jnp.dot(hot, grid.reshape(-1, 2), precision="highest") / jnp.maximum(area, 1.0)[:, None]
-    return center, area
+    hot = (label == jnp.arange(slots)[:, None, None]).astype(jnp.float32)
+    rows, cols = hot.sum(2), hot.sum(1)  # whole numbers, so exact
+    area = rows.sum(-1)
+    x, y = ((jnp.arange(side) - (side - 1) / 2) * WORKSPACE.pixel for side in (w, h))
+    total = jnp.stack([(cols * x).sum(-1), (rows * y).sum(-1)], -1)
+    return total / jnp.maximum(area, 1.0)[:, None], area
 
 
 def contour(foreground: jax.Array) -> jax.Array:
     """Foreground pixels `[H, W]` bool with a neighbour (of eight) on the table or outside the map."""
-    window = (3, 3)
-    inner = jax.lax.reduce_window(foreground.astype(jnp.int32), 1, jax.lax.min, window, (1, 1), ((1, 1), (1, 1)))
     padded = jnp.pad(foreground, 1)
-    edge = jax.lax.reduce_window(padded.astype(jnp.int32), 1, jax.lax.min, window, (1, 1), "VALID")
-    return foreground & ((inner == 0) | (edge == 0))
+    across = padded[:, :-2] & padded[:, 1:-1] & padded[:, 2:]
+    return foreground & ~(across[:-2] & across[1:-1] & across[2:])
 
 
 def footprint_free(height: jax.Array, start: jax.Array, angle: jax.Array) -> jax.Array:

@@ -20,16 +20,16 @@ MAX_SHORT = 0.01
 """Metres by which a gripper may miss its last set point."""
 
 
-def speeds(scenes: Scene, velocity: Array, *, xp: ModuleType = jnp) -> tuple[Array, Array]:
-    """Speeds `[B, N]` (m/s) of objects with `velocity [B, N, 6]`: of the centre, and of the fastest point.
+def speed(scenes: Scene, velocity: Array, *, xp: ModuleType = jnp) -> Array:
+    """Speed `[B, N]` (m/s) of the centres of objects with `velocity [B, N, 6]`; empty slots have none."""
+    return xp.where(scenes.shape >= 0, xp.sqrt((velocity[..., :3] ** 2).sum(-1)), 0.0)
 
-    Empty slots have none; a velocity that is not finite stays so.
-    """
-    present = scenes.shape >= 0
-    linear = xp.linalg.norm(velocity[..., :3], axis=-1)
+
+def _fastest(scenes: Scene, velocity: Array, xp: ModuleType) -> Array:
+    """Speed `[B]` (m/s) of the fastest point of any object, at most."""
     radius = xp.linalg.norm(scenes.size, axis=-1) / 2
-    angular = xp.linalg.norm(velocity[..., 3:], axis=-1) * radius
-    return xp.where(present, linear, 0.0), xp.where(present, xp.maximum(linear, angular), 0.0)
+    spin = xp.where(scenes.shape >= 0, xp.linalg.norm(velocity[..., 3:], axis=-1) * radius, 0.0)
+    return xp.maximum(speed(scenes, velocity, xp=xp), spin).max(-1)
 
 
 def codes(
@@ -65,14 +65,13 @@ def codes(
       `[B]` int32, bits of `Fault`.
     """
     present = scenes.shape >= 0
-    _, speed = speeds(scenes, velocity, xp=xp)
     outside = (xp.abs(position[..., :2]) > WORKSPACE.half).any(-1) & present
     sunk = (shapes.lowest_corner(scenes.shape, scenes.size, position, xp=xp) < -MAX_SINK) & present
     finite = xp.isfinite(xp.where(present[..., None], position, 0.0)).all((1, 2))
     flags = (
         (Fault.NON_FINITE, broken | ~finite),
         (Fault.CAPACITY, full),
-        (Fault.UNSETTLED, settle & (speed > REST_SPEED).any(-1)),
+        (Fault.UNSETTLED, settle & (_fastest(scenes, velocity, xp) > REST_SPEED)),
         (Fault.OUTSIDE, outside.any(-1)),
         (Fault.SPEED, top > MAX_SPEED),
         (Fault.PENETRATION, sunk.any(-1) | (depth > MAX_SINK)),

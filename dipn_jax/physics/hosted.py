@@ -89,7 +89,7 @@ class Watch:
         return np.array(self.sims.qvel[:, GRIPPER_DOF:]).reshape(*self.scenes.shape.shape, 6)
 
     def tick(self) -> None:
-        linear, _ = faults.speeds(self.scenes, self.velocity(), xp=np)
+        linear = faults.speed(self.scenes, self.velocity(), xp=np)
         finite = np.isfinite(linear).all(-1)
         self.broken |= ~finite
         self.top = np.maximum(self.top, np.where(finite, linear.max(-1), 0.0))

@@ -92,13 +92,14 @@ class _Worlds(mujoco_batch.Batch):
         # persistent: sleep needs it, and so do contacts that are read after a step
         super().__init__(models[0], nsim=len(models), nthread=engine.threads, persistent=True)
         self.set_models(models)
-        self._engine = engine
+        self._engine, self._stepped = engine, False
 
     def advance(self) -> tuple[np.ndarray, np.ndarray]:
         """See `hosted.Worlds`. The engine is held no longer than that, so that other threads' batches go on too."""
         if self._engine.stopped.is_set():
             raise physics.Stopped
         try:
+            self._stepped = True
             with self._engine.stepping:
                 self.step(nstep=self._engine.substeps)
         except mujoco_batch.SimulationError as error:
@@ -108,8 +109,9 @@ class _Worlds(mujoco_batch.Batch):
 
     def depths(self) -> np.ndarray:
         """See `hosted.Worlds`."""
-        with contextlib.suppress(mujoco_batch.SimulationError):
-            self.forward()
+        if not self._stepped:  # else the last step's contacts are there
+            with contextlib.suppress(mujoco_batch.SimulationError):
+                self.forward()
         contacts = [self.get_data(i).contact.dist for i in range(self.nsim)]
         return np.array([max(0.0, -dist.min(initial=0.0)) for dist in contacts])
 

@@ -72,7 +72,7 @@ def velocity(state: State, scenes: Scene) -> jax.Array:
 
 def watch(record: Record, state: State, scenes: Scene) -> Record:
     """Note speeds, and whether everything is finite."""
-    linear, _ = faults.speeds(scenes, velocity(state, scenes))
+    linear = faults.speed(scenes, velocity(state, scenes))
     finite = jnp.isfinite(state.qpos).all(-1) & jnp.isfinite(state.qvel).all(-1)
     top = jnp.maximum(record.top, jnp.where(finite, linear.max(-1), 0.0))
     return record.replace(top=top, broken=record.broken | ~finite)
