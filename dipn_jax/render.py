@@ -23,33 +23,34 @@ _STEEP = 1e-6  # |n_z| below which a face is taken as vertical
 _FAR = 1e3
 
 
-def _bounds(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Affine bounds on z, `[N, P, F, 3]` each (constant, x, y): every z must be under the first, over the second."""
+def _bounds(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Affine bounds on z `[N, P, F, 3]` (constant, x, y), which of them are from above, and which parts there are."""
     hulls = jax.vmap(shapes.hull)(scene.shape, scene.size)
     rotation = geometry.quat_to_matrix(poses[:, 3:])
     normal = jnp.einsum("nij,npfj->npfi", rotation, hulls.normals)
     offset = hulls.offsets + jnp.einsum("npfi,ni->npf", normal, poses[:, :3])
     nz = jnp.where(jnp.abs(normal[..., 2]) < _STEEP, _STEEP, normal[..., 2])
     plane = jnp.stack([offset / nz, -normal[..., 0] / nz, -normal[..., 1] / nz], -1)
-    never = jnp.array([_FAR, 0.0, 0.0])
-    up = nz > 0
-    upper = jnp.where(up[..., None], plane, never)
-    lower = jnp.where(up[..., None], -never, plane)
-    dead = ~hulls.alive[:, :, None, None]
-    return jnp.where(dead, -never, upper), lower
+    return plane, nz > 0, hulls.alive
 
 
-def _part_heights(upper: jax.Array, lower: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Top of an object over pixels `x [W]`, `y [H]`; `-_FAR` beside it. Planes `[P, F, 3]`."""
+def _top(plane: jax.Array, above: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Top of a part over pixels `x [W]`, `y [H]`; `-_FAR` beside it. Planes `[F, 3]`, `[F]`."""
+    top, bottom = jnp.float32(_FAR), jnp.float32(-_FAR)
+    for face in range(plane.shape[0]):
+        height = plane[face, 0] + plane[face, 1] * x[None, :] + plane[face, 2] * y[:, None]
+        top = jnp.where(above[face], jnp.minimum(top, height), top)
+        bottom = jnp.where(above[face], bottom, jnp.maximum(bottom, height))
+    return jnp.where(top >= bottom, top, -_FAR)
 
-    def evaluate(plane: jax.Array) -> jax.Array:
-        return plane[0] + plane[1] * x[None, :] + plane[2] * y[:, None]
 
-    best = jnp.full((y.shape[0], x.shape[0]), -_FAR)
-    for part in range(upper.shape[0]):
-        top = functools.reduce(jnp.minimum, [evaluate(plane) for plane in upper[part]])
-        bottom = functools.reduce(jnp.maximum, [evaluate(plane) for plane in lower[part]])
-        best = jnp.where(top >= bottom, jnp.maximum(best, top), best)
+def _tops(plane: jax.Array, above: jax.Array, alive: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Top of an object, as `_top`; planes `[P, F, 3]`. A missing part costs nothing where scenes are not vmapped."""
+    nothing = jnp.full((y.shape[0], x.shape[0]), -_FAR)
+    best = nothing
+    for part in range(plane.shape[0]):
+        seen = jax.lax.cond(alive[part], lambda p=part: _top(plane[p], above[p], x, y), lambda: nothing)
+        best = jnp.maximum(best, seen)
     return best
 
 
@@ -67,7 +68,7 @@ def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixe
     """
     n = scene.shape.shape[0]
     side = min(WINDOW, pixels)
-    upper, lower = _bounds(scene, poses)
+    plane, above, alive = _bounds(scene, poses)
     middle = (pixels - 1) / 2
     # about the middle of the bounding box, which the centre of mass is not
     offset = jnp.asarray(shapes.UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(scene.shape, 0)] * scene.size
@@ -80,7 +81,7 @@ def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixe
         col, row = corner[i, 0], corner[i, 1]
         x = (col + jnp.arange(side) - middle) * WORKSPACE.pixel
         y = (row + jnp.arange(side) - middle) * WORKSPACE.pixel
-        top = _part_heights(upper[i], lower[i], x, y)
+        top = _tops(plane[i], above[i], alive[i], x, y)
         old_height = jax.lax.dynamic_slice(height, (row, col), (side, side))
         old_label = jax.lax.dynamic_slice(label, (row, col), (side, side))
         seen = top > old_height
