@@ -104,7 +104,7 @@ def share(setting: Setting, kind: str, objects: int) -> float:
             replay.run()
 
     times = []
-    for _ in range(setting.pick(3, 5)):
+    for _ in range(setting.pick(3, 2)):
         prepare()
         times.append(alternate(bare, lambda: make_data(job), repeats=1))
         for replay in ready.pop():

@@ -89,6 +89,10 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
         "pushes": lambda: reference()[1],
         "sweep": lambda: world.sweep(native, reference()[0], reference()[2]),
         "camera": lambda: world.camera(keys[2], native, min(50, plan.scenes + 18)),
+        **{
+            f"rest-{name}": lambda name=name, e=e: world.rests(name, e, plan.seed, 1 if name == "warp" else 6)  # type: ignore[misc]
+            for name, e in {"native": native, **engines}.items()
+        },
         **{f"agreement-{name}": lambda name=name, e=e: agree(name, e) for name, e in engines.items()},  # type: ignore[misc]
     }
 
@@ -113,6 +117,17 @@ def page(metrics: dict[str, float]) -> str:
     drops = [[str(n), *(share(f"drop/{n}/{c}") for c in drop_columns)] for n in world.COUNTS]
     grasps = [[i.name, share(f"grasp_isolated/{i.name}"), f"{metrics[f'grasp_isolated_tries/{i.name}']:.0f}"]
               for i in shapes.CATALOGUE]  # fmt: skip
+    rests = [
+        [
+            name,
+            f"{metrics[f'rest/{name}/tries']:.0f}",
+            share(f"rest/{name}/at_rest"),
+            share(f"rest/{name}/as_put"),
+            f"{metrics[f'rest/{name}/from_table_max_mm']:.3f} mm",
+        ]
+        for name in ("native", *world.ENGINES)
+        if f"rest/{name}/tries" in metrics
+    ]
     compared = [name for name in world.ENGINES if f"agreement/{name}/grasp" in metrics]
     engines = [
         [name, f"{metrics[f'agreement/{name}/scenes']:.0f}"]
@@ -126,6 +141,8 @@ def page(metrics: dict[str, float]) -> str:
     return "\n\n".join(
         [
             "## Drops", _table(["objects", *drop_columns], drops),
+            "## Every catalogue item set down on a side of its bounding box",
+            _table(["engine", "tries", "at rest", "as put", "lowest corner from the table, at most"], rests),
             "## Grasps of single objects, centred and antipodal, off by up to 1 cm and 7.5 degrees",
             _table(["item", "held", "tries"], grasps),
             f"Closing on the 100 mm side: {share('grasp_too_wide/held')} held; one finger on top of an object of "

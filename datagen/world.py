@@ -57,6 +57,25 @@ def drops(key: jax.Array, engine: Engine, tries: int) -> Metrics:
     return found
 
 
+def rests(name: str, engine: Engine, seed: int, sides: int) -> Metrics:
+    """`rest/{engine}/...`: every catalogue item set down on `sides` sides of its bounding box.
+
+    Shares that come to rest and that stay as they were put (within TIPPED), and how far from the table, at most, the
+    lowest corner of one at rest is.
+    """
+    made = [isolated.alone(np.random.default_rng(seed), item, sides) for item in shapes.CATALOGUE]
+    scene, poses = structs.concatenate([scene for scene, _ in made]), np.concatenate([start for _, start in made])
+    rollout = primitives.settle(engine, scene, poses, duration=0.6)
+    after, fault = np.asarray(rollout.poses)[:, -1], np.asarray(rollout.fault)
+    gap = 1000 * np.abs(shapes.lowest_corner(scene.shape, scene.size, after, xp=np))[fault == 0]
+    return {
+        f"rest/{name}/at_rest": float((fault == 0).mean()),
+        f"rest/{name}/as_put": float((_turn(after[..., 3:], poses[..., 3:]) < TIPPED).mean()),
+        f"rest/{name}/from_table_max_mm": float(gap.max()),
+        f"rest/{name}/tries": len(fault),
+    }
+
+
 def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
     """`grasp_isolated/{shape}`: share of `isolated.share_held`; and grasps that must not hold."""
     found = {}

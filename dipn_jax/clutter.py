@@ -15,8 +15,8 @@ from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Array, Fault, Observation, Scene, SettledScene
 
-BATCH = 64
-"""Scenes that compiled functions take at a time."""
+BATCH, FEW = 64, 16
+"""Scenes that compiled functions take at a time, of many and of few."""
 MAX_DROPS = 128
 """Drops in a row without a usable scene before giving up."""
 
@@ -71,20 +71,22 @@ def _random_scenes(keys: jax.Array, config: scenes.SceneConfig) -> tuple[Scene, 
 
 
 def in_chunks(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)` for any number of rows: BATCH at a time, so that one compiled shape serves all.
+    """`function(*args)` for any number of rows: BATCH or FEW at a time, so that two compiled shapes serve all.
 
     Args:
-      function: jitted, of pytrees with a leading axis of BATCH rows, each row by itself.
+      function: jitted, of pytrees with a leading axis, each row by itself.
       args: pytrees with a leading axis.
 
     Returns:
       What `function` returns, its rows joined.
     """
     count = len(jax.tree.leaves(args)[0])
-    parts = []
-    for start in range(0, count, BATCH):
-        rows = np.arange(start, start + BATCH) % count
+    parts, start = [], 0
+    while start < count:
+        size = BATCH if count - start > BATCH - FEW else FEW
+        rows = np.arange(start, start + size) % count
         parts.append(function(*jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)))
+        start += size
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
 
 
@@ -95,4 +97,5 @@ def observe(scene: Scene, poses: Array) -> Observation:
 
 @jax.jit
 def _observe(scene: Scene, poses: jax.Array) -> Observation:
-    return jax.lax.map(lambda pair: render.render(*pair), (scene, poses))
+    height, label = jax.lax.map(lambda pair: render.render_depth(*pair), (scene, poses))
+    return Observation(height, jax.vmap(render.paint_labels)(label, scene.color), label)

@@ -1,0 +1,51 @@
+"""The figures of a right world, on few scenes; and the page that shows them."""
+
+import json
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from datagen import check, episodes, world
+from dipn_jax import geometry
+from dipn_jax.errors import UserError
+
+DOCS = pathlib.Path(__file__).parents[2] / "docs"
+
+
+@pytest.fixture(scope="module")
+def trial(settled: Any) -> world.Trial:
+    keys = jax.random.split(jax.random.key(0), len(settled.fault))
+    pushes, _ = episodes.aim_pushes(keys, settled.scene, settled.poses, actions=1)
+    grasps = episodes.aim_grasps(keys, settled.scene, settled.poses, actions=1)
+    pushes, grasps = (jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], x) for x in (pushes, grasps))
+    return world.Trial(settled, pushes, grasps)
+
+
+def test_an_engine_agrees_with_itself_and_a_turn_is_seen(engine: Any, trial: world.Trial) -> None:
+    counted, poses = world.pushes(engine, trial)
+    assert counted["push/moved_objects"] > 2 and 0 <= counted["push/tipped_of_moved"] < 1
+    found = world.agreement("native", engine, trial, poses, world.held_by(engine, trial))
+    assert found["agreement/native/5cm/p90_mm"] == 0 and found["agreement/native/grasp"] == 1
+    quarter = np.asarray(geometry.transform_poses(poses.reshape(-1, 7), np.pi / 2, np.zeros(2))).reshape(poses.shape)
+    turned = world.agreement("native", engine, trial, quarter, np.zeros((6, 5), bool))
+    assert abs(turned["agreement/native/10cm/p50_deg"] - 90) < 0.2
+
+
+def test_a_push_of_its_own_ends_near_the_same_centimetre_of_a_longer_one(engine: Any, trial: world.Trial) -> None:
+    _, poses = world.pushes(engine, trial)
+    found = world.sweep(engine, trial, poses)
+    assert 0 < found["sweep/5cm/p50_mm"] < 2
+
+
+def test_an_unknown_engine_is_named() -> None:
+    with pytest.raises(UserError, match="bullet: want some of native_awake"):
+        check.Plan(("bullet",), 8, 4, 10, 0)
+
+
+def test_the_page_in_docs_shows_the_figures_in_docs() -> None:
+    metrics = json.loads((DOCS / "world.json").read_text())
+    assert check.page(metrics) in (DOCS / "world.md").read_text()
+    assert min(v for k, v in metrics.items() if k.startswith("grasp_isolated/")) >= 0.98
