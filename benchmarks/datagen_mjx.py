@@ -64,7 +64,7 @@ class Naive:
 
     def __init__(self, scene: Scene, poses: np.ndarray, config: model.PhysicsConfig) -> None:
         """Compile for the scene `scene [B]` (the same in every row) from `poses [B, N, 7]`."""
-        config = dataclasses.replace(config, geom_pairs=-1, contact_points=-1)
+        config = dataclasses.replace(config, geom_pairs=None, contact_points=None)
         compiled = mujoco.MjModel.from_xml_string(plain_mjcf(structs.take(scene, 0), config))
         self.model = mjx.put_model(compiled, impl="jax")
         still = primitives.parked_trajectory(1, 1.0).target[0, 0]

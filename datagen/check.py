@@ -15,6 +15,9 @@ from datagen import world
 from dipn_jax import clutter, console, files, shapes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, make_engine
+from dipn_jax.structs import Fault
+
+CAMERA_SCENES = 50
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,20 +50,20 @@ def run(out: pathlib.Path, plan: Plan) -> None:
     for name in plan.engines:
         kind, changes = world.ENGINES[name]
         engines[name] = make_engine(kind, **changes)
-    settings = json.loads(json.dumps(dataclasses.asdict(plan)))
+    settings = json.loads(json.dumps(dataclasses.asdict(plan))) | {"versions": files.package_versions()}
     files.claim(out, settings, free=("engines",))
     sections = _sections(plan, engines)
-    metrics: dict[str, float] = {}
+    metrics: dict[str, float | None] = {}
     with console.Progress("check-world", len(sections), unit="sections") as progress:
         for name, measure in sections.items():
             path = out / "sections" / f"{name}.json"
             if not path.exists():
-                files.write_json(path, measure())
-            metrics.update(files.read_json(path))
+                files.write_json(path, {k: v if np.isfinite(v) else None for k, v in measure().items()})
             progress.advance(1, name)
-    finite = {k: None if not np.isfinite(v) else v for k, v in metrics.items()}
-    files.write_json(out / "settings.json", {**settings, "versions": files.package_versions()})
-    files.write_json(out / "metrics.json", finite)
+    for path in sorted((out / "sections").glob("*.json")):  # those of engines asked for before, too
+        metrics.update(files.read_json(path))
+    files.write_json(out / "settings.json", settings)
+    files.write_json(out / "metrics.json", metrics)
     files.write_atomically(out / "world.md", page(metrics).encode())
     console.say(page(metrics))
 
@@ -88,7 +91,7 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
         "grasps": lambda: world.isolated_grasps(native, plan.seed, plan.tries),
         "pushes": lambda: reference()[1],
         "sweep": lambda: world.sweep(native, reference()[0], reference()[2]),
-        "camera": lambda: world.camera(keys[2], native, min(50, plan.scenes + 18)),
+        "camera": lambda: world.camera(keys[2], native, CAMERA_SCENES),
         **{
             f"rest-{name}": lambda name=name, e=e: world.rests(name, e, plan.seed, 1 if name == "warp" else 6)  # type: ignore[misc]
             for name, e in {"native": native, **engines}.items()
@@ -102,12 +105,12 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def page(metrics: dict[str, float]) -> str:
+def page(metrics: dict[str, Any]) -> str:
     """The figures as Markdown."""
 
     def share(key: str) -> str:
         value = metrics.get(key)
-        return "" if value is None or not np.isfinite(value) else f"{100 * value:.0f} %"
+        return "" if value is None else f"{100 * value:.0f} %"
 
     def pair(key: str, unit: str) -> str:
         low, high = metrics.get(f"{key}/p50_{unit}"), metrics.get(f"{key}/p90_{unit}")
@@ -136,7 +139,8 @@ def page(metrics: dict[str, float]) -> str:
         for name in compared
     ]
     sweeps = [[f"{k} cm", pair(f"sweep/{k}cm", "mm"), pair(f"sweep/{k}cm", "deg")] for k in (3, 5, 7)]
-    pushed = [[k.removeprefix("push/"), share(k)] for k in metrics if k.startswith("push/") and "objects" not in k]
+    counted = ["tipped_of_moved", *Fault.NAMES.values()]
+    pushed = [[name, share(f"push/{name}")] for name in counted]
     at = " / ".join
     return "\n\n".join(
         [
@@ -148,6 +152,7 @@ def page(metrics: dict[str, float]) -> str:
             f"Closing on the 100 mm side: {share('grasp_too_wide/held')} held; one finger on top of an object of "
             f"20 kg: {share('grasp_on_top/held')}.",
             f"## Pushes of 10 cm, {metrics['push/moved_objects']:.0f} objects moved", _table(["what", "share"], pushed),
+            f"Deepest contact at any centimetre, gripper included: {metrics['push/depth_max_mm']:.2f} mm.",
             "## A push of its own against the same centimetre of a longer one " + at(["p50", "p90"]),
             _table(["after", "mm", "degrees"], sweeps),
             "## Camera against MuJoCo's ray caster",

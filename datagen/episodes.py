@@ -58,7 +58,7 @@ def push_batch(
     rollout = primitives.push(engine, repeated.scene, repeated.poses, pushes)
     poses = np.asarray(rollout.poses)
     episodes = PushEpisode(repeated.scene, poses[:, : PUSH_STEPS + 1], poses[:, -1], pushes, np.asarray(rollout.fault))
-    return _drop_unusable(episodes, counts)
+    return _drop_unusable(episodes, counts, together=len(distances))
 
 
 def aim_pushes(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> tuple[Push, jax.Array]:
@@ -120,10 +120,11 @@ def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, c
     return Batch(items if len(items.fault) else None, counts)
 
 
-def _drop_unusable(episodes: Any, counts: dict[str, int]) -> Batch:
+def _drop_unusable(episodes: Any, counts: dict[str, int], *, together: int = 1) -> Batch:
+    """Without the episodes that went wrong, and those `together` with them."""
     fault = episodes.fault
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})
-    good = (fault & Fault.UNUSABLE) == 0
+    good = ((fault & Fault.UNUSABLE) == 0).reshape(-1, together).all(-1).repeat(together)
     return Batch(structs.take(episodes, good) if good.any() else None, counts)
 
 

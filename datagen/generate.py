@@ -44,21 +44,28 @@ class Job:
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,)  # metres: each push is made once for every one of them
 
     def __post_init__(self) -> None:
-        console.require_positive(episodes=self.episodes, shard_size=self.shard_size, actions=self.actions)
+        console.require_positive(episodes=self.episodes, shard_size=self.shard_size)
         console.require_between(1, MAX_ACTIONS, actions=self.actions)
         console.require_seed(self.seed)
         for distance in self.distances:
             console.require_between(0.01, PUSH_STEPS * 0.01, distances=distance)
-        if not self.distances:
-            raise UserError("--distances: want at least one")
+        number = len(self.distances)
+        if len(set(self.distances)) < max(number, 1):
+            raise UserError(f"--distances {self.distances}: want at least one, and none twice")
+        if self.episodes % number or self.shard_size % number:
+            raise UserError(
+                f"--episodes {self.episodes} --shard-size {self.shard_size}: want multiples of {number}, the number of "
+                "distances, so that no push is without some of them"
+            )
 
     def shards(self) -> int:
         """How many shards the data set has."""
         return -(-self.episodes // self.shard_size)
 
     def describe(self) -> dict[str, Any]:
-        """As JSON, beside the shards."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
+        """As JSON, beside the shards; with the kind of device where the size of a batch depends on it."""
+        device = {} if self.engine == "native" else {"device": jax.default_backend()}
+        return json.loads(json.dumps(dataclasses.asdict(self))) | device
 
     def size(self, index: int) -> int:
         """Episodes of shard `index`."""
@@ -142,8 +149,9 @@ def _write_all(job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tal
         records.update_manifest(out)
 
     with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
-        futures = [pool.submit(one, index) for index in todo]
+        futures: list[concurrent.futures.Future[None]] = []
         try:
+            futures += [pool.submit(one, index) for index in todo]
             for future in concurrent.futures.as_completed(futures):
                 future.result()
         except BaseException:

@@ -6,11 +6,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from datagen import episodes, isolated
-from dipn_jax import clutter, geometry, primitives, render, scenes, shapes, structs
-from dipn_jax.physics import Engine, EngineName, native
+from dipn_jax import clutter, geometry, model, primitives, render, scenes, shapes, structs
+from dipn_jax.physics import Engine, EngineName, cores, native
 from dipn_jax.structs import Fault, Grasp, Push, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
 
@@ -114,10 +115,24 @@ def pushes(engine: Engine, made: Trial) -> tuple[Metrics, np.ndarray]:
     moved = np.linalg.norm(poses[:, -1, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED
     up = [np.asarray(geometry.quat_to_matrix(jnp.asarray(poses[:, k, :, 3:])))[..., 2, :] for k in (0, -1)]
     tipped = np.arccos(np.clip((up[0] * up[1]).sum(-1), -1, 1)) > TIPPED
-    found = {"push/tipped_of_moved": float(tipped[moved].mean()), "push/moved_objects": float(moved.sum())}
+    deep = [_depths(made, poses[:, k], np.asarray(rollout.gripper)[:, k]).max() for k in range(PUSH_STEPS + 1)]
+    found = {
+        "push/tipped_of_moved": float(tipped[moved].mean()),
+        "push/moved_objects": float(moved.sum()),
+        "push/depth_max_mm": 1000 * float(max(deep)),
+    }
     for name, n in Fault.count(fault).items():
         found[f"push/{name}"] = n / len(fault)
     return found, poses
+
+
+def _depths(made: Trial, poses: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+    """Deepest contact `[B]` (metres) among objects, table and gripper: one that tunnels is deep on its way."""
+    scene, library = made.items.scene, model.mesh_library(made.items.scene)
+    texts = [model.mjcf(structs.take(scene, i), config=native.DEFAULTS, library=library) for i in range(len(poses))]
+    models = [mujoco.MjModel.from_xml_string(text) for text in texts]
+    hand = np.concatenate([gripper[:, :4], gripper[:, 4:] / 2, gripper[:, 4:] / 2], -1)
+    return native.contact_depths(models, np.concatenate([hand, poses.reshape(len(poses), -1)], -1), threads=cores())
 
 
 def sweep(engine: Engine, made: Trial, poses: np.ndarray) -> Metrics:

@@ -38,7 +38,7 @@ def encode(columns: Columns) -> tuple[Columns, dict[str, dict[str, Any]]]:
       `code`: `value`, `delta` (differences along the second axis) or `from poses` (from the last of `poses`).
 
     Raises:
-      ValueError: a value to quantize is not finite.
+      ValueError: a value to quantize is not finite, or too large.
     """
     stored, specs = dict(columns), {}
     for name, quantum in QUANTA.items():
@@ -47,6 +47,10 @@ def encode(columns: Columns) -> tuple[Columns, dict[str, dict[str, Any]]]:
         if not np.isfinite(columns[name]).all():
             raise ValueError(f"column {name}: not finite")
         stored[name] = np.rint(columns[name].astype(np.float64) / quantum).astype(np.int64)
+        if np.abs(stored[name]).max(initial=0) >= 2**30:
+            raise ValueError(
+                f"column {name}: {np.abs(columns[name]).max():g} is too large for a quantum of {quantum:g}"
+            )
         specs[name] = {"quantum": quantum, "code": "value"}
     if "after" in stored and "poses" in stored:
         stored["after"] = stored["after"] - _last(stored["poses"], stored["after"])

@@ -3,5 +3,5 @@
 from __future__ import annotations
 
 
-class UserError(ValueError):
+class UserError(Exception):
     """Something a user gave cannot be used: what came, what was wanted, what to do."""

@@ -33,8 +33,13 @@ class PhysicsConfig:
     solref: str = "0.01 1"  # softer makes grasps wrong
     solimp: str = "0.95 0.99 0.001"
     sleep: float = 0.0  # m/s below which resting objects are left out of a step until something comes (0: never)
-    geom_pairs: int = -1  # MJX: mesh-mesh pairs kept by the broad phase (-1: all)
-    contact_points: int = -1  # MJX: contacts kept (-1: all)
+    geom_pairs: tuple[int, int] | None = None  # MJX: pairs of geoms kept by the broad phase: some, and more an object
+    contact_points: tuple[int, int] | None = None  # MJX: contacts kept, likewise (None: all)
+
+    def caps(self, slots: int) -> tuple[int, int]:
+        """Pairs and contacts that MJX keeps with `slots` objects; -1: all."""
+        given = (self.geom_pairs, self.contact_points)
+        return tuple(-1 if cap is None else cap[0] + cap[1] * slots for cap in given)  # type: ignore[return-value]
 
 
 def _gripper(gripper: Gripper) -> str:
@@ -161,27 +166,28 @@ def mjcf(
     spin = inertias(scene)
     n = len(scene.shape)
     parts = [_object(scene, i, generic, spin[i]) for i in range(n)]
-    pairs = []
+    floor = []
     for i in range(n):
         mu = float(scene.friction[i]) if scene.shape[i] >= 0 else 1.0
         for part in range(shapes.PARTS):
             alive = scene.shape[i] >= 0 and shapes.CORNERS_USED[int(scene.shape[i]), part] > 0
             gap = "" if generic or alive else ' margin="-1000"'
-            pairs.append(
+            floor.append(
                 f'<pair geom1="floor" geom2="o{i}p{part}" condim="3" friction="{mu:.9g} {mu:.9g} 0.005 0.0001 0.0001"'
                 f' solref="{config.solref}" solimp="{config.solimp}"{gap}/>'
             )
     extra = "" if library is None else _fillers(scene, library)
     if generic:
         extra = _mesh("part", shapes.CLASSES.index("cylinder"), 0, np.full(3, 0.05))
+    pairs, contacts = config.caps(n)
     c, sleep = config, ' sleep="enable"' if config.sleep else ""
     return f"""<mujoco model="dipn">
 <compiler angle="radian"/>
 <option timestep="{c.timestep}" integrator="implicitfast" solver="Newton" cone="{c.cone}" impratio="{c.impratio}"
  iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="1e-8" jacobian="dense"
  sleep_tolerance="{c.sleep}"> <flag multiccd="enable" autoreset="disable"{sleep}/></option>
-<custom><numeric name="max_geom_pairs" data="{c.geom_pairs}"/>
- <numeric name="max_contact_points" data="{c.contact_points}"/></custom>
+<custom><numeric name="max_geom_pairs" data="{pairs}"/>
+ <numeric name="max_contact_points" data="{contacts}"/></custom>
 <default><geom solref="{c.solref}" solimp="{c.solimp}"/>
  <default class="object"><geom contype="1" conaffinity="3" condim="3"/></default>
  <default class="link">
@@ -192,7 +198,7 @@ def mjcf(
 <worldbody><geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="0"/>
 {_gripper(gripper)}
 {"".join(b for b, _ in parts)}</worldbody>
-<contact>{"".join(pairs)}</contact>
+<contact>{"".join(floor)}</contact>
 <equality><joint joint1="left" joint2="right" polycoef="0 1 0 0 0" solref="0.005 1"/></equality>
 <actuator>{_actuators(gripper)}</actuator>
 </mujoco>"""

@@ -110,7 +110,7 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
         ) from None
     if meta["schema_version"] != SCHEMA_VERSION:
         raise UserError(
-            f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it again"
+            f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it anew elsewhere"
         )
     return meta
 
@@ -212,6 +212,8 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
             problems.append((path, f"{path.stat().st_size} bytes, want {entry['bytes']}"))
         elif files.file_sha256(path) != entry["sha256"]:
             problems.append((path, "SHA-256 differs from the manifest's"))
+        else:
+            read_meta(path)  # of this schema version
     listed = set(manifest["shards"])
     problems += [(p, "not in the manifest") for p in sorted(folder.glob("shard-*.parquet")) if p.name not in listed]
     return problems

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import math
 import pathlib
 from typing import Any, TypeAlias
 
@@ -27,6 +26,8 @@ MIN_SIDE = 0.025
 
 
 Range: TypeAlias = tuple[float, float]
+BOUNDS = {"scale": (0.5, 1.2), "density": (10.0, 25_000.0), "friction": (0.01, 5.0)}
+"""Least and most of each range: cork to platinum; what the renderer's window and the fingers' height allow."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Ranges:
     items: tuple[str, ...] = ()
     """Names from the catalogue (`shapes.CATALOGUE`); none given: all of them."""
     scale: Range = (0.9, 1.03)
-    """Of each nominal dimension; no side is made thinner than 25 mm."""
+    """Of each nominal dimension; no side is thinner than 25 mm, no diagonal longer than 126 mm."""
     density: Range = (250.0, 750.0)
     """kg/m^3."""
     friction: Range = (0.28, 0.42)
@@ -45,15 +46,16 @@ class Ranges:
     """Most by which each channel, in [0, 1], differs from a colour of the palette."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in (("scale", self.scale), ("density", self.density), ("friction", self.friction)):
-            if not 0 < low <= high < math.inf:
-                raise UserError(f"{name} {low:g} {high:g}: want two numbers above 0, the smaller one first")
+        for name, (least, most) in BOUNDS.items():
+            low, high = getattr(self, name)
+            if not least <= low <= high <= most:
+                raise UserError(f"--{name} {low:g} {high:g}: want two numbers from {least:g} to {most:g}, in order")
         if not 0 <= self.color_noise <= 1:
-            raise UserError(f"color noise {self.color_noise:g}: want 0 to 1")
+            raise UserError(f"--color-noise {self.color_noise:g}: want 0 to 1")
         names = [item.name for item in shapes.CATALOGUE]
         unknown = [name for name in self.items if name not in names]
         if unknown:
-            raise UserError(f"items {' '.join(unknown)}: not in the catalogue; choose from {' '.join(sorted(names))}")
+            raise UserError(f"--items {' '.join(unknown)}: not in the catalogue; choose from {' '.join(sorted(names))}")
 
 
 DEFAULT_RANGES = Ranges()
@@ -125,9 +127,7 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
     item = jax.random.randint(keys[1], (n,), 0, len(items))
     shape = jnp.where(present, classes[item], ABSENT)
     size = nominal[item] * jax.random.uniform(keys[2], (n, 3), minval=ranges.scale[0], maxval=ranges.scale[1])
-    size = jnp.maximum(size, MIN_SIDE)
-    diagonal = jnp.linalg.norm(size, axis=-1, keepdims=True)
-    size = size * jnp.minimum(1.0, shapes.MAX_DIAGONAL / diagonal)
+    size = _allowed(size)
     colors = jnp.array(shapes.COLORS_RGB, jnp.float32) / 255
     palette = jax.random.permutation(keys[3], len(colors))
     noise = ranges.color_noise * jax.random.uniform(keys[8], (n, 3), minval=-1.0)
@@ -142,6 +142,15 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
     poses = jnp.concatenate([xy, z[:, None], quat], -1)
     poses = jnp.where(present[:, None], poses, parked(n))
     return Scene(shape.astype(jnp.int32), size, color, mass, friction), poses
+
+
+def _allowed(size: jax.Array) -> jax.Array:
+    """Sizes `[N, 3]` with no side under MIN_SIDE and the longest cut where the diagonal is over MAX_DIAGONAL."""
+    size = jnp.maximum(size, MIN_SIDE)
+    longest = jnp.arange(3) == size.argmax(-1, keepdims=True)
+    others = jnp.where(longest, 0.0, size**2).sum(-1, keepdims=True)
+    limit = jnp.sqrt(jnp.maximum(shapes.MAX_DIAGONAL**2 - others, MIN_SIDE**2))
+    return jnp.where(longest, jnp.minimum(size, limit), size)
 
 
 def _stack_heights(xy: jax.Array, radius: jax.Array, present: jax.Array) -> jax.Array:

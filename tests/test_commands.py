@@ -46,6 +46,15 @@ def test_a_negative_count(call, tmp_path: pathlib.Path) -> None:
     assert not (tmp_path / "d").exists()
 
 
+def test_ranges_and_distances_that_contradict_themselves(call, tmp_path: pathlib.Path) -> None:
+    out = ("datagen", "push", "--out", tmp_path / "d")
+    _one_line(call(*out, "--scale", 1.1, 0.9), "--scale 1.1 0.9")
+    _one_line(call(*out, "--distances", 0.2), "--distances 0.2")
+    _one_line(call(*out, "--distances", 0.1, 0.1), "none twice")
+    _one_line(call("datagen", "check-world", "--out", tmp_path / "d", "--engines", "bullet"), "--engines bullet")
+    assert not (tmp_path / "d").exists()
+
+
 def test_a_missing_folder(call, tmp_path: pathlib.Path) -> None:
     nowhere = tmp_path / "nowhere"
     _one_line(call("datagen", "info", nowhere), "no manifest.json")

@@ -7,6 +7,7 @@ one runs is a configuration value.
 from __future__ import annotations
 
 import dataclasses
+import os
 from types import ModuleType
 from typing import Any, Literal, Protocol
 
@@ -42,6 +43,11 @@ def fence_force(mass: Array, position: Array, velocity: Array, *, xp: ModuleType
     beyond = position - xp.clip(position, -FENCE, FENCE)
     pull = -(FENCE_RATE**2) * beyond - 2 * FENCE_RATE * velocity
     return mass[..., None] * xp.where(beyond == 0, 0.0, pull)
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def substeps(config: PhysicsConfig) -> int:

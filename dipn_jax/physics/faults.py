@@ -75,6 +75,6 @@ def codes(
         (Fault.OUTSIDE, outside.any(-1)),
         (Fault.SPEED, top > MAX_SPEED),
         (Fault.PENETRATION, sunk.any(-1) | (depth > MAX_SINK)),
-        (Fault.SHORT, xp.abs(hand - target).max(-1) > MAX_SHORT),
+        (Fault.SHORT, ~(xp.abs(hand - target).max(-1) <= MAX_SHORT)),
     )
     return sum((xp.where(where, bit, 0) for bit, where in flags), xp.zeros(len(present), xp.int32))

@@ -31,8 +31,8 @@ from dipn_jax.workspace import GRIPPER
 
 DEFAULTS = PhysicsConfig(
     timestep=0.0025,  # as near to the native engine's 0.002 as its own 0.001 is; at 0.005 1 grasp in 10 ends otherwise
-    geom_pairs=32,  # measured: at most 26 overlapping bounding spheres (10 objects, a push)
-    contact_points=80,  # measured: at most 54 contacts with 7 objects, 75 with 10
+    geom_pairs=(10, 3),  # measured: at most 26 overlapping bounding spheres (10 objects, a push)
+    contact_points=(24, 8),  # measured: at most 54 contacts with 7 objects, 75 with 10
 )
 KEY_FRAMES = 8
 """Trajectories are padded to as many key frames, so that all primitives share one program."""
@@ -143,7 +143,8 @@ class _Program:
     """The traced function for one number of slots, with the placeholder model it fills."""
 
     def __init__(self, config: PhysicsConfig, slots: int, substeps: int) -> None:
-        self.config, self.slots, self.substeps = config, slots, substeps
+        self.slots, self.substeps = slots, substeps
+        self.pairs, self.contacts = config.caps(slots)
         full = np.full(slots, 0.1, np.float32)
         scene = Scene(np.zeros(slots, np.int32), np.full((slots, 3), 0.05), np.zeros((slots, 3)), full, full)
         spec = mujoco.MjModel.from_xml_string(model.mjcf(scene, config=config, generic=True))
@@ -155,7 +156,7 @@ class _Program:
         self.culled = [
             np.array(pairs)[:, :2]
             for key, pairs in groups.items()
-            if key.types[0] != GeomType.PLANE and -1 < config.geom_pairs < len(pairs)
+            if key.types[0] != GeomType.PLANE and -1 < self.pairs < len(pairs)
         ]
 
     def run(
@@ -255,7 +256,7 @@ class _Program:
 
     def _saturated(self, m: Any, d: Any) -> jax.Array:
         """Whether MJX may have left out a touching pair or a contact in this step; it says nothing itself."""
-        contact, limit = d._impl.contact, self.config.contact_points
+        contact, limit = d._impl.contact, self.contacts
         full = jnp.zeros((), bool)
         for dim in np.unique(contact.dim):
             rows = contact.dim == dim
@@ -265,7 +266,7 @@ class _Program:
         for first, second in (pairs.T for pairs in self.culled):
             apart = jnp.linalg.norm(d.geom_xpos[first] - d.geom_xpos[second], axis=-1)
             near = apart < m.geom_rbound[first] + m.geom_rbound[second]
-            full |= near.sum() > self.config.geom_pairs
+            full |= near.sum() > self.pairs
         return full
 
 

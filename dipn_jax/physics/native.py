@@ -1,11 +1,10 @@
-"""MuJoCo C on all CPU cores, through `mujoco.batch`. The reference that the other engine is held against."""
+"""MuJoCo C on all CPU cores, through `mujoco.batch`. The reference that the other engines are held against."""
 
 from __future__ import annotations
 
 import collections
 import concurrent.futures
 import contextlib
-import os
 import threading
 
 import jax
@@ -16,6 +15,7 @@ from mujoco import batch as mujoco_batch
 from dipn_jax import model, physics, structs
 from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
 from dipn_jax.physics import hosted
+from dipn_jax.scenes import parked
 from dipn_jax.structs import ABSENT, Array, Rollout, Scene, Trajectory
 from dipn_jax.workspace import WORKSPACE
 
@@ -34,7 +34,7 @@ class NativeEngine:
 
     def __init__(self, config: PhysicsConfig = DEFAULTS, *, threads: int | None = None) -> None:
         self.config, self.substeps = config, physics.substeps(config)
-        self.threads = threads or os.cpu_count() or 1
+        self.threads = threads or physics.cores()
         self.stopped, self.stepping, self._building = threading.Event(), threading.Lock(), threading.Lock()
         self._library: dict[int, np.ndarray] = {}  # by number of objects: the most meshes of each class met so far
         self._models: collections.OrderedDict[bytes, mujoco.MjModel] = collections.OrderedDict()
@@ -56,7 +56,10 @@ class NativeEngine:
         with self._building:
             models = self._compile(packed)
         sims = _Worlds(models, self)
-        sims.qpos[:, GRIPPER_DOF:] = np.take_along_axis(poses, slots[..., None], 1).reshape(len(models), -1)
+        start = np.where(
+            packed.shape[..., None] >= 0, np.take_along_axis(poses, slots[..., None], 1), parked(packed.shape.shape[1])
+        )
+        sims.qpos[:, GRIPPER_DOF:] = start.reshape(len(models), -1)
         sims.qpos[:, :GRIPPER_DOF] = hosted.controls(trajectories, 0.0)
         return hosted.follow(sims, packed, slots, poses, trajectories, np.asarray(samples), settle=settle, fence=fence)
 
@@ -92,14 +95,13 @@ class _Worlds(mujoco_batch.Batch):
         # persistent: sleep needs it, and so do contacts that are read after a step
         super().__init__(models[0], nsim=len(models), nthread=engine.threads, persistent=True)
         self.set_models(models)
-        self._engine, self._stepped = engine, False
+        self._engine, self._models_kept = engine, models
 
     def advance(self) -> tuple[np.ndarray, np.ndarray]:
         """See `hosted.Worlds`. The engine is held no longer than that, so that other threads' batches go on too."""
         if self._engine.stopped.is_set():
             raise physics.Stopped
         try:
-            self._stepped = True
             with self._engine.stepping:
                 self.step(nstep=self._engine.substeps)
         except mujoco_batch.SimulationError as error:
@@ -109,11 +111,22 @@ class _Worlds(mujoco_batch.Batch):
 
     def depths(self) -> np.ndarray:
         """See `hosted.Worlds`."""
-        if not self._stepped:  # else the last step's contacts are there
-            with contextlib.suppress(mujoco_batch.SimulationError):
-                self.forward()
-        contacts = [self.get_data(i).contact.dist for i in range(self.nsim)]
-        return np.array([max(0.0, -dist.min(initial=0.0)) for dist in contacts])
+        return contact_depths(self._models_kept, np.array(self.qpos), threads=self._engine.threads)
+
+
+def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray, *, threads: int) -> np.ndarray:
+    """Deepest contact `[B]` in metres of `models` at `qpos [B, Q]`; 0 where that is not finite.
+
+    Sleeping objects have no contacts among themselves, so this looks at the state anew.
+    """
+    fresh = mujoco_batch.Batch(models[0], nsim=len(models), nthread=threads, persistent=True)
+    fresh.set_models(models)
+    finite = np.isfinite(qpos).all(-1)
+    fresh.qpos[finite] = qpos[finite]
+    with contextlib.suppress(mujoco_batch.SimulationError):
+        fresh.forward()
+    contacts = [fresh.get_data(i).contact.dist for i in range(len(models))]
+    return np.array([max(0.0, -dist.min(initial=0.0)) for dist in contacts]) * finite
 
 
 def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> tuple[np.ndarray, np.ndarray]:

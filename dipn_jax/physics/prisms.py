@@ -32,7 +32,8 @@ SKIN = 1e-3
 MERGE = 1e-5
 """Metres: contacts of one pair nearer than this are one."""
 NARROW = 12
-"""Pairs of one kind (object-object, object-gripper) tested for edges; others must be apart along a face."""
+"""Pairs of one kind (object-object, object-gripper) tested for edges, or two fifths where that is more; others must be
+apart along a face."""
 APART = 1.0
 """Distance reported where there is no contact."""
 LEFT_OUT = 0.0
@@ -275,7 +276,7 @@ def _narrow(m: Any, d: Any, key: Any, geom: jax.Array) -> Contacts:
     """`convex_prism` for the NARROW most overlapping of the pairs `geom [G, 2]`; results for all of them."""
     pairs, axes = _gather(m, d, key, geom)
     gap = jax.vmap(face_gap, in_axes=axes)(*pairs)
-    _, chosen = jax.lax.top_k(-gap, min(NARROW, len(geom)))
+    _, chosen = jax.lax.top_k(-gap, min(max(NARROW, 2 * len(geom) // 5), len(geom)))
     pairs, axes = _gather(m, d, key, geom[chosen])
     found = jax.vmap(convex_prism, in_axes=axes)(*pairs)
     rest = jnp.where(gap < 0, LEFT_OUT, APART)

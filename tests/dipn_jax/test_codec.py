@@ -45,6 +45,11 @@ def test_a_palette_colour_is_exact() -> None:
     np.testing.assert_allclose(codec.decode(stored, specs)["scene.color"], color, atol=1e-7)
 
 
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="too large"):
+        codec.encode({"scene.mass": np.full((1, 1), 3000.0, np.float32)})
+
+
 def test_what_is_not_finite_is_refused(rng: np.random.Generator) -> None:
     columns = _columns(rng, push=True)
     columns["poses"][0, 0, 0, 0] = np.nan

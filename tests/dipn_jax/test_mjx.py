@@ -183,7 +183,7 @@ def test_a_batch_is_shared_by_all_devices_with_equal_results(tmp_path: pathlib.P
 
 
 def test_contacts_that_are_left_out_are_a_fault() -> None:
-    cramped = MjxEngine(dataclasses.replace(mjx.DEFAULTS, contact_points=2))
+    cramped = MjxEngine(dataclasses.replace(mjx.DEFAULTS, contact_points=(2, 0)))
     size, flat = np.full((1, 1, 3), 0.05, np.float32), np.full((1, 1), 0.35, np.float32)
     box = Scene(np.zeros((1, 1), np.int32), size, size, flat, flat)
     pose = np.array([[[0, 0, 0.0249, 1, 0, 0, 0]]], np.float32)

@@ -130,6 +130,30 @@ def test_a_spike_of_speed_and_an_object_inside_another_are_faults(engine: Any, r
     assert [bool(f & Fault.PENETRATION) for f in at_once.fault] == [False, True, False]
 
 
+def test_what_is_inside_another_stays_a_fault_when_it_sleeps(engine: Any) -> None:
+    size, flat = np.full((1, 2, 3), 0.05, np.float32), np.full((1, 2), 0.35, np.float32)
+    cubes = Scene(np.zeros((1, 2), np.int32), size, size, flat / 7, flat)
+    poses = np.zeros((1, 2, 7), np.float32)
+    poses[..., 2], poses[..., 3], poses[0, 1, 2] = 0.025, 1, 0.075
+    stacked = primitives.settle(engine, cubes, poses, duration=1.0)
+    assert stacked.fault[0] == 0
+    models = engine._compile(structs.take(cubes, slice(0, 1)))
+    qpos = np.concatenate([[0, 0, 2, 0, 0, 0], stacked.poses[0, 0].reshape(-1)])[None]
+    assert 1e-6 < native.contact_depths(models, qpos, threads=1)[0] < 1e-3
+    qpos[0, 6 + 7 + 2] -= 0.01
+    assert native.contact_depths(models, qpos, threads=1)[0] > 0.009
+
+
+def test_what_is_not_finite_is_a_fault_of_its_own_episode(engine: Any, resting: Any) -> None:
+    scene, poses = resting
+    bad = np.array(poses)
+    bad[1, 0, 2] = np.nan
+    bad[2, 1] = np.nan  # an empty slot
+    fault = primitives.settle(engine, scene, bad, duration=0.05).fault
+    assert fault[1] & Fault.NON_FINITE
+    assert not fault[[0, 2, 3, 4]].any()
+
+
 def test_lack_of_room_is_a_fault(engine: Any, resting: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, poses = resting
     original = model.mjcf

@@ -98,3 +98,18 @@ def test_a_config_that_contradicts_itself_is_named() -> None:
         scenes.SceneConfig(slots=2, counts=(0.5, 0.3, 0.2))
     with pytest.raises(UserError, match="not in the catalogue"):
         scenes.Ranges(items=("banana",))
+
+
+def test_ranges_out_of_bounds_are_named_as_options() -> None:
+    for change in ({"scale": (1.0, 0.9)}, {"density": (0.001, 500.0)}, {"friction": (0.1, float("nan"))}):
+        with pytest.raises(UserError, match=f"--{next(iter(change))}"):
+            scenes.Ranges(**change)  # type: ignore[arg-type]
+
+
+def test_sizes_stay_within_bounds_whatever_the_scale() -> None:
+    config = scenes.fixed_count(10, ranges=scenes.Ranges(scale=(0.5, 1.2)))
+    size = np.asarray(
+        jax.vmap(lambda k: scenes.random_scene(k, config=config)[0].size)(jax.random.split(jax.random.key(0), 20))
+    )
+    assert size.min() >= scenes.MIN_SIDE - 1e-7
+    assert np.linalg.norm(size, axis=-1).max() <= shapes.MAX_DIAGONAL + 1e-6

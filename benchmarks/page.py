@@ -1,0 +1,46 @@
+"""`python -m benchmarks.page FILE.json ...`: the figures of several runs as the tables of docs/benchmarks.md."""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+from collections.abc import Sequence
+
+from benchmarks.__main__ import BENCHMARKS
+from benchmarks.harness import Figures
+from dipn_jax import console, files
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def tables(figures: Figures) -> str:
+    """Ratios with their goals, then episodes a second, as Markdown."""
+    ratios = [_row(["figure", "goal", "value"]), _row(["---"] * 3)]
+    rates: dict[str, dict[int, float]] = {}
+    for name, value in figures.items():
+        base = next(known for known in BENCHMARKS if name == known or name.startswith((f"{known}/", f"{known}.")))
+        if base == "rates":
+            kind, _, count = name.removeprefix("rates.").rpartition("/")
+            rates.setdefault(kind.replace("/", ", "), {})[int(count)] = value
+        else:
+            plain = name == base or name.rpartition("/")[2].isdigit()
+            ratios.append(_row([f"`{name}`", BENCHMARKS[base].goal if plain else "", f"{value:.3g}"]))
+    counts = sorted({count for row in rates.values() for count in row})
+    speeds = [_row(["episodes a second", *map(str, counts)]), _row(["---"] * (len(counts) + 1))]
+    for kind, row in rates.items():
+        speeds.append(_row([kind, *(f"{row[count]:.3g}" if count in row else "" for count in counts)]))
+    return "\n".join(ratios) + "\n\n" + "\n".join(speeds) + "\n"
+
+
+def merged(paths: Sequence[pathlib.Path]) -> Figures:
+    """Figures of several files of `--out`; of one measured twice, the later file's."""
+    figures: Figures = {}
+    for path in paths:
+        figures.update(files.read_json(path)["figures"])
+    return figures
+
+
+if __name__ == "__main__":
+    console.say(tables(merged([pathlib.Path(name) for name in sys.argv[1:]])))
