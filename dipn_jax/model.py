@@ -33,13 +33,13 @@ class PhysicsConfig:
     solref: str = "0.01 1"  # softer makes grasps wrong
     solimp: str = "0.95 0.99 0.001"
     sleep: float = 0.0  # m/s below which resting objects are left out of a step until something comes (0: never)
-    geom_pairs: tuple[int, int] | None = None  # MJX: pairs of geoms kept by the broad phase: some, and more an object
+    geom_pairs: tuple[int, int] | None = None  # MJX: pairs kept by the broad phase: at least, and an object
     contact_points: tuple[int, int] | None = None  # MJX: contacts kept, likewise (None: all)
 
     def caps(self, slots: int) -> tuple[int, int]:
         """Pairs and contacts that MJX keeps with `slots` objects; -1: all."""
         given = (self.geom_pairs, self.contact_points)
-        return tuple(-1 if cap is None else cap[0] + cap[1] * slots for cap in given)  # type: ignore[return-value]
+        return tuple(-1 if cap is None else max(cap[0], cap[1] * slots) for cap in given)  # type: ignore[return-value]
 
 
 def _gripper(gripper: Gripper) -> str:

@@ -31,8 +31,8 @@ from dipn_jax.workspace import GRIPPER
 
 DEFAULTS = PhysicsConfig(
     timestep=0.0025,  # as near to the native engine's 0.002 as its own 0.001 is; at 0.005 1 grasp in 10 ends otherwise
-    geom_pairs=(10, 3),  # measured: at most 26 overlapping bounding spheres (10 objects, a push)
-    contact_points=(24, 8),  # measured: at most 54 contacts with 7 objects, 75 with 10
+    geom_pairs=(32, 4),  # measured: at most 26 overlapping bounding spheres (10 objects, a push)
+    contact_points=(80, 8),  # measured: at most 54 contacts with 7 objects, 75 with 10
 )
 KEY_FRAMES = 8
 """Trajectories are padded to as many key frames, so that all primitives share one program."""
