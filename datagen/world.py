@@ -11,7 +11,7 @@ import numpy as np
 
 from datagen import episodes, isolated
 from dipn_jax import clutter, geometry, model, primitives, render, scenes, shapes, structs
-from dipn_jax.physics import Engine, EngineName, cores, native
+from dipn_jax.physics import Engine, EngineName, native
 from dipn_jax.structs import Fault, Grasp, Push, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
 
@@ -132,7 +132,7 @@ def _depths(made: Trial, poses: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     texts = [model.mjcf(structs.take(scene, i), config=native.DEFAULTS, library=library) for i in range(len(poses))]
     models = [mujoco.MjModel.from_xml_string(text) for text in texts]
     hand = np.concatenate([gripper[:, :4], gripper[:, 4:] / 2, gripper[:, 4:] / 2], -1)
-    return native.contact_depths(models, np.concatenate([hand, poses.reshape(len(poses), -1)], -1), threads=cores())
+    return native.contact_depths(models, np.concatenate([hand, poses.reshape(len(poses), -1)], -1))
 
 
 def sweep(engine: Engine, made: Trial, poses: np.ndarray) -> Metrics:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
-import contextlib
 import threading
 
 import jax
@@ -92,7 +91,7 @@ class _Worlds(mujoco_batch.Batch):
     """See `hosted.Worlds`."""
 
     def __init__(self, models: list[mujoco.MjModel], engine: NativeEngine) -> None:
-        # persistent: sleep needs it, and so do contacts that are read after a step
+        # persistent, for sleep
         super().__init__(models[0], nsim=len(models), nthread=engine.threads, persistent=True)
         self.set_models(models)
         self._engine, self._models_kept = engine, models
@@ -111,22 +110,23 @@ class _Worlds(mujoco_batch.Batch):
 
     def depths(self) -> np.ndarray:
         """See `hosted.Worlds`."""
-        return contact_depths(self._models_kept, np.array(self.qpos), threads=self._engine.threads)
+        return contact_depths(self._models_kept, np.array(self.qpos))
 
 
-def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray, *, threads: int) -> np.ndarray:
-    """Deepest contact `[B]` in metres of `models` at `qpos [B, Q]`; 0 where that is not finite.
+def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray) -> np.ndarray:
+    """Deepest contact `[B]` in metres of `models`, all of one layout, at `qpos [B, Q]`; 0 where that is not finite.
 
     Sleeping objects have no contacts among themselves, so this looks at the state anew.
     """
-    fresh = mujoco_batch.Batch(models[0], nsim=len(models), nthread=threads, persistent=True)
-    fresh.set_models(models)
-    finite = np.isfinite(qpos).all(-1)
-    fresh.qpos[finite] = qpos[finite]
-    with contextlib.suppress(mujoco_batch.SimulationError):
-        fresh.forward()
-    contacts = [fresh.get_data(i).contact.dist for i in range(len(models))]
-    return np.array([max(0.0, -dist.min(initial=0.0)) for dist in contacts]) * finite
+    data, deepest = mujoco.MjData(models[0]), np.zeros(len(models))
+    for i in np.flatnonzero(np.isfinite(qpos).all(-1)):
+        data.qpos[:] = qpos[i]
+        try:
+            mujoco.mj_fwdPosition(models[i], data)
+        except mujoco.FatalError:  # no room for its contacts: a fault that stepping has noted
+            data = mujoco.MjData(models[0])
+        deepest[i] = -min(data.contact.dist.min(initial=0.0), 0.0)
+    return deepest
 
 
 def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> tuple[np.ndarray, np.ndarray]:

@@ -139,9 +139,9 @@ def test_what_is_inside_another_stays_a_fault_when_it_sleeps(engine: Any) -> Non
     assert stacked.fault[0] == 0
     models = engine._compile(structs.take(cubes, slice(0, 1)))
     qpos = np.concatenate([[0, 0, 2, 0, 0, 0], stacked.poses[0, 0].reshape(-1)])[None]
-    assert 1e-6 < native.contact_depths(models, qpos, threads=1)[0] < 1e-3
+    assert 1e-6 < native.contact_depths(models, qpos)[0] < 1e-3
     qpos[0, 6 + 7 + 2] -= 0.01
-    assert native.contact_depths(models, qpos, threads=1)[0] > 0.009
+    assert native.contact_depths(models, qpos)[0] > 0.009
 
 
 def test_what_is_not_finite_is_a_fault_of_its_own_episode(engine: Any, resting: Any) -> None:
