@@ -14,10 +14,10 @@ import numpy as np
 
 from benchmarks import bullet_worker
 from benchmarks.bullet_worker import CONTROL_PERIOD, Settings, Work
-from benchmarks.harness import Setting, Skipped, alternate, cores, make_data
+from benchmarks.harness import Setting, Skipped, alternate, make_data
 from datagen.generate import Job
 from dipn_jax import clutter, model, primitives, scenes, shapes, structs
-from dipn_jax.physics import make_engine
+from dipn_jax.physics import cores, make_engine
 from dipn_jax.structs import Push, Scene, SettledScene
 from dipn_jax.workspace import GRIPPER
 

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import importlib
 import io
-import os
 import pathlib
 import platform
 import statistics
@@ -18,6 +17,7 @@ from typing import Any, Literal
 
 from datagen import generate
 from dipn_jax import files
+from dipn_jax.physics import cores
 
 Figures = dict[str, float]
 Scale = Literal["small", "full"]
@@ -89,11 +89,6 @@ def make_data(job: generate.Job) -> int:
         folder = pathlib.Path(name) / "data"
         generate.generate(job, folder)
         return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def machine() -> dict[str, Any]:

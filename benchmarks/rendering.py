@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
 
-from benchmarks.harness import Setting, alternate, cores
+from benchmarks.harness import Setting, alternate
 from dipn_jax import clutter, model, render, scenes, structs
-from dipn_jax.physics import make_engine
+from dipn_jax.physics import cores, make_engine
 from dipn_jax.structs import ABSENT, Observation, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 

@@ -105,65 +105,104 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def page(metrics: dict[str, Any]) -> str:
-    """The figures as Markdown."""
+class _Cells:
+    """Figures as they stand in tables; nothing where there is none."""
 
-    def share(key: str) -> str:
-        value = metrics.get(key)
+    def __init__(self, metrics: dict[str, Any]) -> None:
+        self.metrics = metrics
+
+    def share(self, key: str) -> str:
+        value = self.metrics.get(key)
         return "" if value is None else f"{100 * value:.0f} %"
 
-    def pair(key: str, unit: str) -> str:
-        low, high = metrics.get(f"{key}/p50_{unit}"), metrics.get(f"{key}/p90_{unit}")
-        return "" if low is None or high is None else f"{low:.2f} / {high:.2f}"
+    def number(self, key: str, form: str) -> str:
+        value = self.metrics.get(key)
+        return "" if value is None else format(value, form)
 
-    drop_columns = ["kept", "outside", "unsettled", "speed", "penetration", "capacity", "non_finite"]
-    drops = [[str(n), *(share(f"drop/{n}/{c}") for c in drop_columns)] for n in world.COUNTS]
-    grasps = [[i.name, share(f"grasp_isolated/{i.name}"), f"{metrics[f'grasp_isolated_tries/{i.name}']:.0f}"]
-              for i in shapes.CATALOGUE]  # fmt: skip
+    def pair(self, key: str, unit: str) -> str:
+        return " / ".join(self.number(f"{key}/{q}_{unit}", ".2f") for q in ("p50", "p90"))
+
+
+def page(metrics: dict[str, Any]) -> str:
+    """The figures as Markdown."""
+    cells = _Cells(metrics)
+    parts = [
+        *_drop_parts(cells),
+        *_grasp_parts(cells),
+        *_push_parts(cells),
+        *_camera_parts(cells),
+        *_engine_parts(cells),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _drop_parts(cells: _Cells) -> list[str]:
+    columns = ["kept", "outside", "unsettled", "speed", "penetration", "capacity", "non_finite"]
+    drops = [[str(n), *(cells.share(f"drop/{n}/{c}") for c in columns)] for n in world.COUNTS]
     rests = [
         [
             name,
-            f"{metrics[f'rest/{name}/tries']:.0f}",
-            share(f"rest/{name}/at_rest"),
-            share(f"rest/{name}/as_put"),
-            f"{metrics[f'rest/{name}/from_table_max_mm']:.3f} mm",
+            cells.number(f"rest/{name}/tries", ".0f"),
+            cells.share(f"rest/{name}/at_rest"),
+            cells.share(f"rest/{name}/as_put"),
+            cells.number(f"rest/{name}/from_table_max_mm", ".3f") + " mm",
         ]
         for name in ("native", *world.ENGINES)
-        if f"rest/{name}/tries" in metrics
+        if f"rest/{name}/tries" in cells.metrics
     ]
-    compared = [name for name in world.ENGINES if f"agreement/{name}/grasp" in metrics]
-    engines = [
-        [name, f"{metrics[f'agreement/{name}/scenes']:.0f}"]
-        + [pair(f"agreement/{name}/{at}", unit) for at in ("1cm", "5cm", "10cm") for unit in ("mm", "deg")]
-        + [share(f"agreement/{name}/grasp"), share(f"agreement/{name}/unsettled")]
-        for name in compared
+    return [
+        "## Drops",
+        _table(["objects", *columns], drops),
+        "## Every catalogue item set down on a side of its bounding box",
+        _table(["engine", "tries", "at rest", "as put", "lowest corner from the table, at most"], rests),
     ]
-    sweeps = [[f"{k} cm", pair(f"sweep/{k}cm", "mm"), pair(f"sweep/{k}cm", "deg")] for k in (3, 5, 7)]
-    counted = ["tipped_of_moved", *Fault.NAMES.values()]
-    pushed = [[name, share(f"push/{name}")] for name in counted]
-    at = " / ".join
-    return "\n\n".join(
-        [
-            "## Drops", _table(["objects", *drop_columns], drops),
-            "## Every catalogue item set down on a side of its bounding box",
-            _table(["engine", "tries", "at rest", "as put", "lowest corner from the table, at most"], rests),
-            "## Grasps of single objects, centred and antipodal, off by up to 1 cm and 7.5 degrees",
-            _table(["item", "held", "tries"], grasps),
-            f"Closing on the 100 mm side: {share('grasp_too_wide/held')} held; one finger on top of an object of "
-            f"20 kg: {share('grasp_on_top/held')}.",
-            f"## Pushes of 10 cm, {metrics['push/moved_objects']:.0f} objects moved", _table(["what", "share"], pushed),
-            f"Deepest contact at any centimetre, gripper included: {metrics['push/depth_max_mm']:.2f} mm.",
-            "## A push of its own against the same centimetre of a longer one " + at(["p50", "p90"]),
-            _table(["after", "mm", "degrees"], sweeps),
-            "## Camera against MuJoCo's ray caster",
-            f"{metrics['camera/scenes']:.0f} scenes of ten objects: labels equal on "
-            f"{100 * metrics['camera/labels_equal']:.4f} % of pixels; heights there within 0.1 mm but for "
-            f"{metrics['camera/heights_apart']:.0f} on edges (largest {metrics['camera/height_max_mm']:.2f} mm).",
-            "## Engines against `native` at 2 ms, objects that it moves: " + at(["p50", "p90"]),
-            _table(
-                ["engine", "scenes"] + [f"{c} cm, {u}" for c in (1, 5, 10) for u in ("mm", "deg")]
-                + ["grasps equal", "unsettled"],
-                engines,
-            ),
-        ]
-    ) + "\n"  # fmt: skip
+
+
+def _grasp_parts(cells: _Cells) -> list[str]:
+    rows = [
+        [i.name, cells.share(f"grasp_isolated/{i.name}"), cells.number(f"grasp_isolated_tries/{i.name}", ".0f")]
+        for i in shapes.CATALOGUE
+    ]
+    return [
+        "## Grasps of single objects, centred and antipodal, off by up to 1 cm and 7.5 degrees",
+        _table(["item", "held", "tries"], rows),
+        f"Closing on the 100 mm side: {cells.share('grasp_too_wide/held')} held; one finger on top of an object of "
+        f"20 kg: {cells.share('grasp_on_top/held')}.",
+    ]
+
+
+def _push_parts(cells: _Cells) -> list[str]:
+    pushed = [[name, cells.share(f"push/{name}")] for name in ("tipped_of_moved", *Fault.NAMES.values())]
+    sweeps = [[f"{k} cm", cells.pair(f"sweep/{k}cm", "mm"), cells.pair(f"sweep/{k}cm", "deg")] for k in (3, 5, 7)]
+    return [
+        f"## Pushes of 10 cm, {cells.number('push/moved_objects', '.0f')} objects moved",
+        _table(["what", "share"], pushed),
+        f"Deepest contact at any centimetre, gripper included: {cells.number('push/depth_max_mm', '.2f')} mm.",
+        "## A push of its own against the same centimetre of a longer one p50 / p90",
+        _table(["after", "mm", "degrees"], sweeps),
+    ]
+
+
+def _camera_parts(cells: _Cells) -> list[str]:
+    return [
+        "## Camera against MuJoCo's ray caster",
+        f"{cells.number('camera/scenes', '.0f')} scenes of ten objects: labels equal on "
+        f"{cells.number('camera/labels_equal', '.4%').replace('%', ' %')} of pixels; heights there within 0.1 mm "
+        f"but for {cells.number('camera/heights_apart', '.0f')} on edges (largest "
+        f"{cells.number('camera/height_max_mm', '.2f')} mm).",
+    ]
+
+
+def _engine_parts(cells: _Cells) -> list[str]:
+    rows = [
+        [name, cells.number(f"agreement/{name}/scenes", ".0f")]
+        + [cells.pair(f"agreement/{name}/{at}", unit) for at in ("1cm", "5cm", "10cm") for unit in ("mm", "deg")]
+        + [cells.share(f"agreement/{name}/grasp"), cells.share(f"agreement/{name}/unsettled")]
+        for name in world.ENGINES
+        if f"agreement/{name}/grasp" in cells.metrics
+    ]
+    columns = [f"{c} cm, {u}" for c in (1, 5, 10) for u in ("mm", "deg")]
+    return [
+        "## Engines against `native` at 2 ms, objects that it moves: p50 / p90",
+        _table(["engine", "scenes", *columns, "grasps equal", "unsettled"], rows),
+    ]
