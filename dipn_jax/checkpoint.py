@@ -86,6 +86,20 @@ def save(
         shutil.rmtree(old)
 
 
+def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
+    """Copy the weights of a run's newest whole step to `out`, without what only training needs.
+
+    Raises:
+      UserError: as `load_network`.
+    """
+    model = load_network(run, network=network)
+    folder, meta = newest(find(run, network=network))  # type: ignore[misc]
+    known = ("format_version", "network", "network_config", "step", "versions", "sha256")
+    extra = {key: value for key, value in meta.items() if key not in known}
+    config = config_from_json(network, meta["network_config"])
+    save(out, int(folder.name), {"model": nnx.state(model)}, network=network, config=config, extra=extra)
+
+
 def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
     """The meta data of a step folder, or None if anything in it is missing or changed."""
     try:
@@ -132,16 +146,27 @@ def config_from_json(name: str, values: dict[str, Any]) -> Any:
     return NETWORKS[name][0](**fields)
 
 
+def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
+    """The folder of a run; `builtin` stands for the network that comes with the package, if one does."""
+    if str(run) != "builtin":
+        return run
+    folder = pathlib.Path(__file__).with_name("data") / network
+    if not folder.is_dir():
+        raise UserError(f"builtin: no {network} network comes with this package; give the --out of a dipn-train run")
+    return folder
+
+
 def load_network(run: pathlib.Path, *, network: str) -> nnx.Module:
     """The network of the newest whole step, in evaluation mode.
 
     Args:
-      run: a run's folder.
+      run: a run's folder, or `builtin`.
       network: a key of NETWORKS, what the caller can use.
 
     Raises:
       UserError: no run there, no whole step in it, or it holds another network.
     """
+    run = find(run, network=network)
     if not run.is_dir():
         raise UserError(f"checkpoint {run}: no such folder; give the --out of a dipn-train run")
     found = newest(run)

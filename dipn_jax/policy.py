@@ -11,9 +11,12 @@ import jax.numpy as jnp
 from flax import nnx
 
 from dipn_jax import checkpoint, imagine
-from dipn_jax.networks import dipn, grasp
+from dipn_jax.networks import dipn, grasp, push_frame
 from dipn_jax.planner import Predictor, Scorer
 from dipn_jax.structs import ABSENT, Observation, Push
+
+Courses = Callable[[Observation, Push, jax.Array], jax.Array]
+"""(observation, pushes [P], distances [P, K] metres) -> motion [P, K, N, 3]: as a Predictor's, after each distance."""
 
 
 def static_predictor(slots: int) -> Predictor:
@@ -44,15 +47,44 @@ def _frozen(model: nnx.Module) -> Callable[[], nnx.Module]:
     return lambda: nnx.merge(graph, state)
 
 
+def dipn_motions(
+    model: dipn.DIPN, observation: Observation, pushes: Push, distances: jax.Array, *, slots: int
+) -> jax.Array:
+    """Motions by pushes `[P]`, each on its own observation `[P, H, W]` or all on the same `[H, W]`.
+
+    Args:
+      model: in evaluation mode.
+      observation: masks are its labels, whoever found them.
+      pushes: `[P]`; their own distance is not looked at.
+      distances: `[P, K]` metres.
+      slots: N.
+
+    Returns:
+      `[P, K, N, 3]`: dx, dy (metres) of each mask's centroid, dtheta (radians), workspace.
+    """
+    axis = None if observation.label.ndim == 2 else 0
+    make = functools.partial(push_frame.push_input, slots=slots, view=model.config.view)
+    inputs, _ = jax.vmap(make, in_axes=(axis, axis, 0))(observation.label, observation.height, pushes)
+    motion = dipn.symmetric(model, inputs, distances)
+    return push_frame.to_workspace(motion.swapaxes(1, 2), pushes.angle[:, None])
+
+
+def dipn_courses(model: dipn.DIPN, slots: int) -> Courses:
+    """DIPN for many pushes and many distances of each in one call."""
+    thaw = _frozen(model)
+
+    def predict(observation: Observation, pushes: Push, distances: jax.Array) -> jax.Array:
+        return dipn_motions(thaw(), observation, pushes, distances, slots=slots)  # type: ignore[arg-type]
+
+    return predict
+
+
 def dipn_predictor(model: dipn.DIPN, slots: int) -> Predictor:
-    """DIPN as a predictor; masks are the observation's labels."""
-    thaw, stride = _frozen(model), model.config.stride
+    """DIPN as a predictor of each push's own distance."""
+    courses = dipn_courses(model, slots)
 
     def predict(observation: Observation, pushes: Push) -> jax.Array:
-        network = thaw()
-        make = functools.partial(dipn.push_input, slots=slots, stride=stride)
-        inputs, _ = jax.vmap(make, in_axes=(None, 0))(observation.label, pushes)
-        return dipn.to_workspace(network(inputs), pushes.angle)
+        return courses(observation, pushes, pushes.distance[:, None])[:, 0]
 
     return predict
 

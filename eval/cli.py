@@ -9,9 +9,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from dipn_jax import console, scenes
+from dipn_jax import checkpoint, console, scenes
+from dipn_jax.errors import UserError
 from dipn_jax.physics import EngineName, make_engine
 from eval import clearing, grasping, metrics, prediction, resume
+from eval import curve as curves
 from eval import instances as tables_to_clear
 from eval import report as reporting
 
@@ -35,36 +37,65 @@ def _finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any],
 
 
 def predict(
-    push_net: pathlib.Path,
     out: pathlib.Path,
+    push_net: pathlib.Path | None = None,
+    curve: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="curve")] = (),
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 300,
     objects: Objects = "1:7",
     seed: int = 1_000_000,
     engine: EngineName = "auto",
     physics: bool = True,
+    segmented: bool = True,
+    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
 ) -> None:
     """Error of the predicted masks after 5 and 10 cm of a push, on scenes never trained on.
 
       dipn-eval prediction --push-net runs/dipn --out results/prediction
+      dipn-eval prediction --push-net builtin --density 1000 1500 --out results/heavier
+
+    Error against number of pushes, with a band over seeds (curve.png, and in metrics.json push_error/curve/PUSHES/...):
+      dipn-eval prediction --curve runs/curve/* --scenes 1000 --out results/curve
 
     Args:
-      push_net: run of dipn-train push.
       out: folder for metrics.json and pictures.
+      push_net: run of dipn-train push, or builtin: the network that comes with the package.
+      curve: runs of dipn-train push with different --limit and --seed.
       scenes_: how many pushes, one a scene.
       objects: number of objects in a scene.
       seed: of scenes and pushes; keep it away from the training data's.
       engine: what truth is.
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
+      segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
+      ranges: what random objects are drawn from.
     """
     settings = dict(locals())
     _check(out, seed, scenes=scenes_)
-    config = scenes.parse_objects(objects)
-    partial = resume.Partial(out, settings, inputs=[push_net])
+    if not push_net and not curve:
+        raise UserError("prediction: nothing to measure; give --push-net or --curve")
+    config = scenes.parse_objects(objects, ranges=ranges)
+    inputs = [checkpoint.find(run, network="dipn") for run in (*([push_net] if push_net else []), *curve)]
+    networks = curves.load(inputs[1:] if push_net else inputs)
+    names = list(networks)
+    if push_net:
+        networks = {"dipn": checkpoint.load_network(inputs[0], network="dipn"), **networks}  # type: ignore[dict-item]
+    partial = resume.Partial(out, settings, inputs=inputs)
     values, films = prediction.evaluate(
-        push_net, make_engine(engine), config, partial, scenes=scenes_, seed=seed, physics=physics
+        networks,
+        make_engine(engine),
+        config,
+        partial,
+        scenes=scenes_,
+        seed=seed,
+        physics=physics,
+        segmented=segmented,
     )
+    kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in names)}
+    values = kept | curves.summary(values, names)
     out.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(out / "films.npz", **films)  # type: ignore[arg-type]
+    if curve:
+        for which in ("all", "moved"):
+            curves.figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
     _finish(out, values, settings, partial)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 
 from dipn_jax import (
     candidates,
@@ -21,11 +21,12 @@ from dipn_jax import (
     policy,
     primitives,
     render,
+    segment,
     shapes,
     structs,
 )
+from dipn_jax.networks.dipn import DIPN
 from dipn_jax.physics import Engine
-from dipn_jax.planner import Predictor
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.structs import Fault, Observation, Push, Scene, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
@@ -35,10 +36,15 @@ DISTANCES = (5, 10)
 """Centimetres at which errors are reported."""
 FILMS = 6
 """Pushes kept as pictures."""
+_METRES = np.array(DISTANCES, np.float32) * 0.01
+
+Predict = Callable[[Observation, Push], jax.Array]
+"""(observations [B], pushes [B]) -> motion [B, K, N, 3] after DISTANCES: dx, dy (metres), dtheta (radians)."""
+Rows = dict[str, list[np.ndarray]]
 
 
 def evaluate(
-    push_net: pathlib.Path,
+    networks: Mapping[str, DIPN],
     engine: Engine,
     config: SceneConfig,
     partial: resume.Partial,
@@ -46,29 +52,30 @@ def evaluate(
     scenes: int,
     seed: int,
     physics: bool,
+    segmented: bool,
 ) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Errors of every predictor on held-out scenes, one push each.
 
     Args:
-      push_net: run of `dipn-train push`.
+      networks: what to measure by the name it gets in the metrics; the first also makes the pictures.
       engine: what truth is.
       config: scenes.
       partial: where an interrupted evaluation is kept.
       scenes: how many.
       seed: of the scenes and pushes.
       physics: also roll the engine out with nominal mass and friction.
+      segmented: also measure with masks found in the image.
 
     Returns:
-      Flat metrics, and pictures `[4, ...]` of some pushes (before, predicted, after 10 cm).
+      Flat metrics, and pictures `[F, ...]` of some pushes (before, predicted, after 10 cm).
     """
     slots = config.slots
-    predictors: dict[str, Predictor] = {
-        "dipn": policy.load_predictor(push_net, slots),
-        "static": policy.static_predictor(slots),
-        "trans": policy.trans_predictor(slots),
+    predictors = {name: network_predictor(network, slots) for name, network in networks.items()}
+    predictors |= {
+        "static": _at_distances(policy.static_predictor(slots)),
+        "trans": _at_distances(policy.trans_predictor(slots)),
     }
-    measure = {name: _measurer(predictor, slots) for name, predictor in predictors.items()}
-    rows: dict[str, list[np.ndarray]] = {}
+    rows: Rows = {}
     films: list[dict[str, np.ndarray]] = []
     done, batch, rows, films = partial.load((0, 0, rows, films))
     with console.Progress("prediction", scenes, unit="pushes", done=done) as progress:
@@ -77,29 +84,56 @@ def evaluate(
             items = clutter.settled_exactly(drop, engine, config, min(clutter.BATCH, scenes - done))
             pushes, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)
             items, pushes, truth, rolled = _execute(engine, items, pushes, np.asarray(feasible), physics)
-            for i in range(len(pushes.angle)):
-                scene, push = structs.take(items.scene, i), structs.take(pushes, i)
-                for centimetres in DISTANCES:
-                    push = push.replace(distance=np.float32(centimetres * 0.01))
-                    arrays = (scene, push, truth[i, 0], truth[i, centimetres])
-                    for name, function in measure.items():
-                        _record(rows, name, centimetres, function(*arrays))
-                    if rolled is not None:
-                        errors = _measure_rollout(*arrays, rolled[i, centimetres], slots=slots)
-                        _record(rows, "physics", centimetres, errors)
-                if len(films) < FILMS:
-                    films.append(_film(scene, push, truth[i], predictors["dipn"], slots))
-                progress.advance(1)
+            if len(pushes.angle):
+                seen = jax.tree.map(np.asarray, clutter.observe(items.scene, items.poses))
+                after = _labels_after(items.scene, truth)
+                first = measure(rows, "", predictors, seen, seen, pushes, truth, after, rolled)
+                if segmented:
+                    found = seen.replace(label=_found(seen, slots))
+                    measure(rows, "_segmented", predictors, found, seen, pushes, truth, after, rolled)
+                for i in range(min(FILMS - len(films), len(pushes.angle))):
+                    films.append(_film(items, pushes, seen, first, truth, i))
+            progress.advance(len(pushes.angle))
             done, batch = done + len(pushes.angle), batch + 1
             partial.save((done, batch, rows, films))
-    names = [*measure, *(["physics"] if physics else [])]
-    return _summary(rows, names), {k: np.stack([film[k] for film in films]) for k in films[0]}
+    names = [*predictors, *(["physics"] if physics else [])]
+    return _summary(rows, names, segmented), {k: np.stack([film[k] for film in films]) for k in films[0]}
+
+
+def network_predictor(network: DIPN, slots: int) -> Predict:
+    """A network as it is measured here; networks of one architecture share a compiled function."""
+    graph, state = nnx.split(network)
+    distances = lambda count: np.broadcast_to(_METRES, (count, len(_METRES)))  # noqa: E731
+    return lambda seen, pushes: clutter.in_chunks(
+        lambda *rows: _network_motions(graph, state, slots, *rows), seen, pushes, distances(len(pushes.angle))
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def _network_motions(
+    graph: Any, state: Any, slots: int, seen: Observation, pushes: Push, distances: jax.Array
+) -> jax.Array:
+    return policy.dipn_motions(nnx.merge(graph, state), seen, pushes, distances, slots=slots)
+
+
+def _at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict:
+    """A planner's predictor as one of batches; a baseline's push is made once for each distance."""
+
+    @jax.jit
+    def predict(seen: Observation, pushes: Push) -> jax.Array:
+        def one(pair: tuple[Observation, Push]) -> jax.Array:
+            repeated = jax.tree.map(lambda leaf: jnp.repeat(leaf[None], len(_METRES), 0), pair[1])
+            return predictor(pair[0], repeated.replace(distance=jnp.asarray(_METRES)))
+
+        return jax.lax.map(one, (seen, pushes))
+
+    return lambda seen, pushes: clutter.in_chunks(predict, seen, pushes)
 
 
 def _execute(
     engine: Engine, items: SettledScene, pushes: Push, feasible: np.ndarray, physics: bool
 ) -> tuple[SettledScene, Push, np.ndarray, np.ndarray | None]:
-    """The feasible pushes whose simulation went well, what they did `[B, 12, N, 7]`, and what nominal ones did."""
+    """The feasible pushes that went well, poses `[B, 1 + K, N, 7]` before and after, and after nominal ones."""
     items, pushes = structs.take(items, feasible), structs.take(pushes, feasible)
     if not feasible.any():
         return items, pushes, np.zeros((0,)), None
@@ -107,12 +141,18 @@ def _execute(
     good = (np.asarray(result.fault) & Fault.UNUSABLE) == 0
     rolled = None
     if physics:
-        rolled = np.asarray(primitives.push(engine, _nominal(items.scene), items.poses, pushes).poses)[good]
-    return structs.take(items, good), structs.take(pushes, good), np.asarray(result.poses)[good], rolled
+        nominal = primitives.push(engine, _nominal(items.scene), items.poses, pushes)
+        rolled = np.asarray(nominal.poses)[good][:, list(DISTANCES)]
+    truth = np.asarray(result.poses)[good][:, [0, *DISTANCES]]
+    return structs.take(items, good), structs.take(pushes, good), truth, rolled
+
+
+def _one_push(keys: jax.Array, scene: Scene, poses: Any) -> tuple[Push, jax.Array]:
+    return clutter.in_chunks(_push_each, keys, scene, poses)
 
 
 @jax.jit
-def _one_push(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Push, jax.Array]:
+def _push_each(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Push, jax.Array]:
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Push, jax.Array]:
         key, one_scene, one_poses = args
         seen = render.render(one_scene, one_poses)
@@ -123,72 +163,124 @@ def _one_push(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Push, ja
     return jax.lax.map(one, (keys, jax.tree.map(jnp.asarray, scene), jnp.asarray(poses)))
 
 
-def _errors(seen: Observation, motion: jax.Array, centers: jax.Array, true_label: jax.Array, slots: int) -> Any:
-    predicted = imagine.imagine(seen, centers, motion)
-    return losses.mask_errors(predicted.label, true_label, slots)
+def _labels_after(scene: Scene, truth: np.ndarray) -> np.ndarray:
+    """True labels `[B, K, H, W]` after each distance."""
+    each = [clutter.observe(scene, truth[:, 1 + k]).label for k in range(len(DISTANCES))]
+    return np.stack([np.asarray(label) for label in each], 1)
 
 
-def _measurer(predictor: Predictor, slots: int) -> Callable[..., dict[str, jax.Array]]:
-    """A jitted (scene, push, pose before, pose after) -> errors of every object."""
+def _found(seen: Observation, slots: int) -> np.ndarray:
+    """Labels `[B, H, W]` of masks found in the images, numbered as the objects that they overlap most.
 
-    @jax.jit
-    def measure(scene: Scene, push: Push, before: jax.Array, after: jax.Array) -> dict[str, jax.Array]:
-        seen = render.render(scene, before)
-        motion = predictor(seen, jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], push))[0]
-        return _compare(scene, seen, motion, before, after, slots)
+    The rest take the numbers left over, so that the network sees what the segmenter saw.
+    """
+    labels = []
+    for height, color, true in zip(seen.height, seen.color, seen.label, strict=True):
+        found = segment.segment(height, color, slots=slots)
+        matched = segment.match(found, true, slots=slots)
+        renumbered = np.full(slots + 1, structs.ABSENT)  # the last: no segment
+        taken = np.flatnonzero(matched != structs.ABSENT)
+        renumbered[matched[taken]] = taken
+        rest = np.setdiff1d(np.arange(slots), matched[taken])
+        renumbered[rest] = np.setdiff1d(np.arange(slots), taken)
+        labels.append(renumbered[found].astype(np.int32))
+    return np.stack(labels)
 
-    return measure
+
+def measure(
+    rows: Rows,
+    suffix: str,
+    predictors: Mapping[str, Predict],
+    seen: Observation,
+    true: Observation,
+    pushes: Push,
+    truth: np.ndarray,
+    after: np.ndarray,
+    rolled: np.ndarray | None,
+) -> np.ndarray:
+    """Append the errors of a batch to `rows`; returns the first predictor's motions `[B, K, N, 3]`.
+
+    Args:
+      rows: grows by `NAME SUFFIX/MEASURE` `[B, K, N]` a predictor, and by `visible` and `moved`.
+      suffix: of the names.
+      predictors: what to measure.
+      seen: `[B]` what the predictors see.
+      true: `[B]` the same with the true labels.
+      pushes: `[B]`.
+      truth: `[B, 1 + K, N, 7]` poses before and after each distance.
+      after: `[B, K, H, W]` true labels after.
+      rolled: `[B, K, N, 7]` poses after nominal pushes, measured as `physics`.
+    """
+    slots = truth.shape[2]
+    centers, motion = clutter.in_chunks(_true_motion, seen.label, truth)
+    if not suffix:
+        visible = np.asarray((true.label[..., None] == np.arange(slots)).any((1, 2)))
+        rows.setdefault("visible", []).append(np.repeat(visible[:, None], len(DISTANCES), 1))
+        rows.setdefault("moved", []).append(np.asarray(losses.moved(motion)) & visible[:, None])
+    motions = {name: predictor(seen, pushes) for name, predictor in predictors.items()}
+    if rolled is not None:
+        before_rolled = np.concatenate([truth[:, :1], rolled], 1)
+        motions["physics"] = clutter.in_chunks(_true_motion, seen.label, before_rolled)[1]
+    for name, predicted in motions.items():
+        errors = clutter.in_chunks(_errors, seen, centers, predicted, motion, after)
+        for key, value in errors.items():
+            rows.setdefault(f"{name}{suffix}/{key}", []).append(np.asarray(value))
+    return np.asarray(next(iter(motions.values())))
 
 
-@functools.partial(jax.jit, static_argnames="slots")
-def _measure_rollout(
-    scene: Scene, push: Push, before: jax.Array, after: jax.Array, rolled: jax.Array, *, slots: int
+@jax.jit
+def _true_motion(label: jax.Array, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Centroids `[B, N, 2]` of the masks seen and how poses `[B, 1 + K, N, 7]` move them `[B, K, N, 3]`."""
+    centers, _ = jax.vmap(lambda one: candidates.mask_centers(one, poses.shape[2]))(label)
+    return centers, geometry.planar_motion(poses[:, :1], poses[:, 1:], centers[:, None])
+
+
+@jax.jit
+def _errors(
+    seen: Observation, centers: jax.Array, motion: jax.Array, true_motion: jax.Array, after: jax.Array
 ) -> dict[str, jax.Array]:
-    seen = render.render(scene, before)
-    centers, _ = candidates.mask_centers(seen.label, slots)
-    return _compare(scene, seen, geometry.planar_motion(before, rolled, centers), before, after, slots)
+    """Errors `[B, K, N]` of motions `[B, K, N, 3]` against true ones and true labels `[B, K, H, W]`."""
+    slots = centers.shape[1]
 
+    def one(args: tuple[Observation, jax.Array, jax.Array, jax.Array]) -> Any:
+        image, center, motions, labels = args
+        return jax.lax.map(
+            lambda pair: losses.mask_errors(imagine.imagine(image, center, pair[0]).label, pair[1], slots),
+            (motions, labels),
+        )
 
-def _compare(
-    scene: Scene, seen: Observation, motion: jax.Array, before: jax.Array, after: jax.Array, slots: int
-) -> dict[str, jax.Array]:
-    centers, area = candidates.mask_centers(seen.label, slots)
-    _, true_label = render.render_depth(scene, after)
-    true_motion = geometry.planar_motion(before, after, centers)
-    iou, xor = _errors(seen, motion, centers, true_label, slots)
-    shift = jnp.linalg.norm((motion - true_motion)[:, :2], axis=-1) * 1000
-    turn = jnp.abs(geometry.wrap_angle((motion - true_motion)[:, 2])) * 180 / jnp.pi
+    iou, xor = jax.lax.map(one, (seen, centers, motion, after))
     return {
-        "one_minus_iou": iou,
-        "paper": xor,
-        "position_mm": shift,
-        "angle_deg": turn,
-        "visible": area > 0,
-        "moved": losses.moved(true_motion) & (area > 0),
+        "push_error": iou,
+        "push_error_paper_measure": xor,
+        "push_position_mm": jnp.linalg.norm((motion - true_motion)[..., :2], axis=-1) * 1000,
+        "push_angle_deg": jnp.abs(geometry.wrap_angle((motion - true_motion)[..., 2])) * 180 / jnp.pi,
     }
 
 
-def _record(rows: dict[str, list[np.ndarray]], name: str, centimetres: int, values: dict[str, jax.Array]) -> None:
-    for key, value in values.items():
-        rows.setdefault(f"{name}/{centimetres}cm/{key}", []).append(np.asarray(value))
-
-
-def _summary(rows: dict[str, list[np.ndarray]], names: list[str]) -> dict[str, float]:
+def _summary(rows: Rows, names: list[str], segmented: bool) -> dict[str, float]:
     metrics: dict[str, float] = {}
-    for name in names:
-        for centimetres in DISTANCES:
+    joined = {key: np.concatenate(values) for key, values in rows.items()}
+
+    def mean(key: str, k: int, counted: np.ndarray) -> float:
+        return float(joined[key][:, k][counted].mean()) if counted.any() else float("nan")
+
+    for k, centimetres in enumerate(DISTANCES):
+        visible, moved = joined["visible"][:, k], joined["moved"][:, k]
+        for name in names:
             at = f"{name}/{centimetres}cm"
-            visible, moved = np.concatenate(rows[f"{at}/visible"]), np.concatenate(rows[f"{at}/moved"])
-            for title, key in (("push_error", "one_minus_iou"), ("push_error_paper_measure", "paper")):
-                values = np.concatenate(rows[f"{at}/{key}"])
-                metrics[f"{title}/{at}/all"] = float(values[visible].mean())
-                metrics[f"{title}/{at}/moved"] = float(values[moved].mean()) if moved.any() else float("nan")
-            for key in ("position_mm", "angle_deg"):
-                values = np.concatenate(rows[f"{at}/{key}"])[moved]
-                metrics[f"push_{key}/{at}/moved"] = float(values.mean()) if moved.any() else float("nan")
-            metrics[f"objects_moved/{centimetres}cm"] = int(moved.sum())
+            for key in ("push_error", "push_error_paper_measure"):
+                metrics[f"{key}/{at}/all"] = mean(f"{name}/{key}", k, visible)
+                metrics[f"{key}/{at}/moved"] = mean(f"{name}/{key}", k, moved)
+                if segmented:
+                    title = key.replace("push_error", "push_error_segmented")
+                    metrics[f"{title}/{at}/all"] = mean(f"{name}_segmented/{key}", k, visible)
+                    metrics[f"{title}/{at}/moved"] = mean(f"{name}_segmented/{key}", k, moved)
+            for key in ("push_position_mm", "push_angle_deg"):
+                metrics[f"{key}/{at}/moved"] = mean(f"{name}/{key}", k, moved)
+        metrics[f"objects_moved/{centimetres}cm"] = int(moved.sum())
     metrics["objects"] = int(visible.sum())
-    metrics["pushes"] = len(rows[f"{names[0]}/{DISTANCES[0]}cm/visible"])
+    metrics["pushes"] = len(visible)
     return metrics
 
 
@@ -199,14 +291,17 @@ def _nominal(scene: Scene) -> Scene:
     return scene.replace(mass=mass.astype(np.float32), friction=np.full(shape.shape, 0.35, np.float32))
 
 
-def _film(scene: Scene, push: Push, truth: np.ndarray, predictor: Predictor, slots: int) -> dict[str, np.ndarray]:
-    seen = render.render(scene, truth[0])
-    centers, _ = candidates.mask_centers(seen.label, slots)
-    motion = predictor(seen, jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], push))[0]
-    after = render.render(scene, truth[PUSH_STEPS])
+def _film(
+    items: SettledScene, pushes: Push, seen: Observation, motions: np.ndarray, truth: np.ndarray, i: int
+) -> dict[str, np.ndarray]:
+    """Pictures of push `i` of a batch: before, predicted, after the longest distance."""
+    image = structs.take(seen, i)
+    centers, _ = candidates.mask_centers(jnp.asarray(image.label), truth.shape[2])
+    after = render.render(structs.take(items.scene, i), truth[i, -1])
+    push = structs.take(pushes, i)
     return {
-        "before": np.asarray(seen.color),
-        "predicted": np.asarray(imagine.imagine(seen, centers, motion).color),
+        "before": np.asarray(image.color),
+        "predicted": np.asarray(imagine.imagine(image, centers, motions[i, -1]).color),
         "after": np.asarray(after.color),
-        "push": np.array([*np.asarray(push.start), push.angle, push.distance], np.float32),
+        "push": np.array([*np.asarray(push.start), push.angle, DISTANCES[-1] * 0.01], np.float32),
     }

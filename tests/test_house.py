@@ -17,8 +17,8 @@ STAGES = ("datagen", "train", "eval")
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
     "errors", "structs", "workspace", "geometry", "shapes", "scenes", "model", "physics", "primitives", "render",
-    "candidates", "imagine", "losses", "networks", "planner", "files", "codec", "records", "checkpoint", "clutter",
-    "policy", "console",
+    "segment", "candidates", "imagine", "losses", "networks", "planner", "files", "codec", "records", "checkpoint",
+    "clutter", "policy", "console",
 ]  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from train.loop import Task, TrainConfig, fit
 from train.push import PushTask
 
 Preset = Literal["compact", "paper"]
+ShapeClass = Literal["cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave"]
 
 
 def _fit(task: Task, config: TrainConfig, out: pathlib.Path, **options: Any) -> None:
@@ -33,6 +34,7 @@ def push(
     seed: int = 0,
     limit: int | None = None,
     centimetres: tuple[int, ...] = tuple(range(1, 11)),
+    without: tuple[ShapeClass, ...] = (),
     eval_every: int = 250,
     save_every: int = 250,
 ) -> None:
@@ -54,11 +56,13 @@ def push(
       seed: seed of weights, order and augmentation.
       limit: use only the first so many episodes.
       centimetres: push distances learnt.
+      without: leave out scenes with an object of these classes, to see how well they are guessed.
       eval_every: steps between points of the learning curve.
       save_every: steps between checkpoints.
     """
     config = TrainConfig(steps, batch, learning_rate, weight_decay, optimizer, seed, eval_every, save_every)
-    _fit(PushTask(data, DipnConfig(preset=preset), limit=limit, centimetres=centimetres), config, out)
+    task = PushTask(data, DipnConfig(preset=preset), limit=limit, centimetres=centimetres, without=without)
+    _fit(task, config, out)
 
 
 def grasp_pretrain(
@@ -131,9 +135,28 @@ def grasp(
     _fit(GraspTask(data, network_config), config, out, initial=initial)
 
 
+def export(
+    run: pathlib.Path,
+    out: pathlib.Path,
+    network: Literal["dipn", "grasp"] = "dipn",
+) -> None:
+    """The weights of a run alone, a quarter of its size: a run that can be given to others, not gone on with.
+
+      dipn-train export --run runs/dipn --out dipn_jax/data/dipn
+
+    Args:
+      run: run folder.
+      out: new run folder.
+      network: what is in it.
+    """
+    console.require_out(out)
+    checkpoint.export(run, out, network=network)
+    console.say(f"{out}: {network}")
+
+
 def main() -> None:
     """Entry point."""
-    commands = {"push": push, "grasp-pretrain": grasp_pretrain, "grasp": grasp}
+    commands = {"push": push, "grasp-pretrain": grasp_pretrain, "grasp": grasp, "export": export}
     sys.exit(console.run("Train the push and grasp networks; every run can be interrupted and resumed.", commands))
 
 

@@ -48,6 +48,7 @@ class PretrainTask:
 
     def __init__(self, data: pathlib.Path, config: grasp.GraspConfig) -> None:
         scenes, self.fingerprint = records.load(data, kind="images")
+        self.examples = len(scenes.fault)
         self.train_set, self.test_set = split(scenes, data)
         self.size = len(self.train_set.fault)
         self.network_config = config
@@ -95,6 +96,7 @@ class GraspTask:
 
     def __init__(self, data: pathlib.Path, config: grasp.GraspConfig) -> None:
         episodes, self.fingerprint = records.load(data, kind="grasp")
+        self.examples = len(episodes.fault)
         self.train_set, self.test_set = split(episodes, data)
         self.window = WINDOWS[config.preset]
         self.size = len(self.train_set.fault)

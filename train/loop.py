@@ -44,6 +44,7 @@ class Task(Protocol):
     network: str  # key of checkpoint.NETWORKS
     network_config: Any
     size: int  # training examples
+    examples: int  # with those held out
     fingerprint: str  # of the data
 
     def fetch(self, index: np.ndarray) -> Any:
@@ -128,7 +129,7 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
             parts,
             network=task.network,
             config=task.network_config,
-            extra={"seed": config.seed, "data": task.fingerprint, **latest},
+            extra={"seed": config.seed, "data": task.fingerprint, "examples": task.examples, **latest},
         )
 
     step = begin

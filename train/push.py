@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import geometry, losses, records, render, structs
+from dipn_jax import geometry, losses, records, render, shapes, structs
 from dipn_jax.errors import UserError
-from dipn_jax.networks import dipn
+from dipn_jax.networks import dipn, push_frame
+from dipn_jax.networks.push_frame import PushInput, View
 from dipn_jax.structs import PushEpisode
 from dipn_jax.workspace import PUSH_STEPS
 from train.split import split
@@ -25,7 +26,13 @@ class PushTask:
     network = "dipn"
 
     def __init__(
-        self, data: pathlib.Path, config: dipn.DipnConfig, *, limit: int | None, centimetres: tuple[int, ...]
+        self,
+        data: pathlib.Path,
+        config: dipn.DipnConfig,
+        *,
+        limit: int | None,
+        centimetres: tuple[int, ...],
+        without: tuple[str, ...] = (),
     ) -> None:
         """Load a data set.
 
@@ -34,18 +41,22 @@ class PushTask:
           config: architecture.
           limit: use only the first so many episodes.
           centimetres: distances learnt, each 1 to 10.
+          without: leave out scenes with an object of these classes (`shapes.CLASSES`).
         """
         if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
             raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
         episodes, fingerprint = records.load(data, kind="push")
+        if without:
+            classes = [shapes.CLASSES.index(name) for name in without]
+            episodes = structs.take(episodes, ~np.isin(episodes.scene.shape, classes).any(1))
         count = len(episodes.fault)
         if limit is not None and not 2 <= limit <= count:
-            raise UserError(f"--limit {limit}: want 2 to {count}, the number of episodes in {data}")
+            raise UserError(f"--limit {limit}: want 2 to {count}, the number of episodes of {data} to use")
         count = count if limit is None else limit
         self.train_set, self.test_set = split(structs.take(episodes, slice(0, count)), data)
         self.network_config = config
-        self.size = len(self.train_set.fault)
-        self.fingerprint = f"{fingerprint}:{count}:{centimetres}"
+        self.size, self.examples = len(self.train_set.fault), count
+        self.fingerprint = ":".join(map(str, (fingerprint, count, centimetres, *without)))
         self.centimetres = np.array(centimetres, np.int32)
         self.slots = episodes.scene.shape.shape[1]
         shortest = 100 * float(np.min(episodes.push.distance))
@@ -58,27 +69,35 @@ class PushTask:
         """See `loop.Task`."""
         return structs.take(self.train_set, index)
 
-    def prepare(self, episodes: PushEpisode, centimetres: jax.Array) -> tuple[dipn.PushInput, jax.Array]:
-        """Inputs `[B]` and targets `[B, N, 3]` (pixels, degrees, push frame) at `centimetres [B]`."""
-        return jax.vmap(functools.partial(example, slots=self.slots, stride=self.network_config.stride))(
+    def prepare(self, episodes: PushEpisode, centimetres: jax.Array) -> tuple[PushInput, jax.Array]:
+        """Inputs `[B]` and targets `[B, N, K, 3]` (pixels, degrees, push frame) at `centimetres [B, K]`."""
+        return jax.vmap(functools.partial(example, slots=self.slots, view=self.network_config.view))(
             episodes, centimetres
         )
 
     def loss(self, model: nnx.Module, batch: PushEpisode, key: jax.Array) -> jax.Array:
-        """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored."""
+        """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored.
+
+        `compact` is taught every distance by every example, `paper`, which has one output, a random one.
+        """
         count = batch.fault.shape[0]
         distance_key, mirror_key = jax.random.split(key)
-        weight = jnp.log(self._recorded(batch).astype(jnp.float32))
-        chosen = jnp.asarray(self.centimetres)[jax.random.categorical(distance_key, weight)]
-        inputs, target = self.prepare(batch, chosen)
+        taught = self._recorded(batch)
+        if self.network_config.preset == "paper":
+            drawn = jax.random.categorical(distance_key, jnp.log(taught.astype(jnp.float32)))
+            centimetres, taught = jnp.asarray(self.centimetres)[drawn][:, None], jnp.ones((count, 1), bool)
+        else:
+            centimetres = jnp.broadcast_to(self.centimetres, taught.shape)
+        inputs, target = self.prepare(batch, centimetres)
         flipped = jax.random.bernoulli(mirror_key, 0.5, (count,))
 
         def pick(mirrored: jax.Array, seen: jax.Array) -> jax.Array:
             return jnp.where(flipped.reshape(-1, *[1] * (seen.ndim - 1)), mirrored, seen)
 
-        inputs = jax.tree.map(pick, dipn.mirror(inputs), inputs)
-        target = pick(target * jnp.array([1.0, -1.0, -1.0]), target)
-        return losses.motion_loss(model(inputs), target, inputs.present)
+        inputs = jax.tree.map(pick, push_frame.mirror(inputs), inputs)
+        target = pick(push_frame.mirror_motion(target), target)
+        predicted = model(inputs, centimetres * 0.01)
+        return losses.motion_loss(predicted, target, inputs.present[..., None] & taught[:, None])
 
     def _recorded(self, episodes: PushEpisode) -> jax.Array:
         """Which of the distances learnt the pushes `[B]` reach: `[B, centimetres]` bool."""
@@ -101,23 +120,20 @@ class PushTask:
     @functools.partial(jax.jit, static_argnums=(0, 1))
     def _measure(self, graph: Any, state: Any, episodes: PushEpisode, weight: jax.Array) -> tuple[jax.Array, ...]:
         model = nnx.merge(graph, state)
-        distance = jnp.where(self._recorded(episodes), self.centimetres, 0).max(-1)
-        inputs, target = self.prepare(episodes, distance)
-        predicted = model(inputs)
-        counted = inputs.present & weight[:, None]
+        farthest = jnp.where(self._recorded(episodes), self.centimetres, 0).max(-1, keepdims=True)
+        inputs, target = self.prepare(episodes, farthest)
+        predicted = model(inputs, farthest * 0.01)
+        counted = inputs.present[..., None] & weight[:, None, None]
         loss = losses.motion_loss(predicted, target, counted)
         moved = losses.moved(target / losses.PIXELS_DEGREES) & counted
         error = jnp.linalg.norm((predicted - target)[..., :2], axis=-1) / losses.PIXELS_DEGREES[0] * 1000
         return loss, (error * moved).sum() / jnp.maximum(moved.sum(), 1), moved.sum()
 
 
-def example(
-    episode: PushEpisode, centimetres: jax.Array, *, slots: int, stride: int
-) -> tuple[dipn.PushInput, jax.Array]:
-    """One episode as input and target `[N, 3]` (pixels, degrees, push frame) after `centimetres []`."""
-    before, after = episode.poses[0], episode.poses[centimetres]
-    _, label = render.render_depth(episode.scene, before)
-    push = episode.push.replace(distance=centimetres * 0.01)
-    inputs, centers = dipn.push_input(label, push, slots=slots, stride=stride)
-    motion = geometry.planar_motion(before, after, centers)
-    return inputs, dipn.from_workspace(motion, push.angle)
+def example(episode: PushEpisode, centimetres: jax.Array, *, slots: int, view: View) -> tuple[PushInput, jax.Array]:
+    """One episode as input and targets `[N, K, 3]` (pixels, degrees, push frame) after `centimetres [K]`."""
+    before = episode.poses[0]
+    height, label = render.render_depth(episode.scene, before)
+    inputs, centers = push_frame.push_input(label, height, episode.push, slots=slots, view=view)
+    motion = jax.vmap(lambda after: geometry.planar_motion(before, after, centers))(episode.poses[centimetres])
+    return inputs, push_frame.from_workspace(motion, episode.push.angle).swapaxes(0, 1)

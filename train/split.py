@@ -12,7 +12,7 @@ from dipn_jax.errors import UserError
 
 
 def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
-    """Training examples, and about the last tenth; no scene is on both sides.
+    """Training examples, and about the last tenth, 1,000 at most; no scene is on both sides.
 
     Args:
       episodes: a struct with `scene` and a leading `[B]`; the actions tried on one scene stand together.
@@ -25,6 +25,6 @@ def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
     begins = np.flatnonzero((size[1:] != size[:-1]).any((1, 2))) + 1  # first examples of the second, third, ... scene
     if not len(begins):
         raise UserError(f"data set {data}: {len(size)} examples of one scene; want at least two scenes")
-    wanted = len(size) - max(1, len(size) // 10)
+    wanted = len(size) - min(1000, max(1, len(size) // 10))
     cut = int(begins[np.argmin(np.abs(begins - wanted))])
     return structs.take(episodes, slice(0, cut)), structs.take(episodes, slice(cut, len(size)))

@@ -10,11 +10,14 @@ import pytest
 from flax import nnx
 
 from dipn_jax import geometry, losses, render, structs
-from dipn_jax.networks import dipn, grasp
+from dipn_jax.networks import dipn, grasp, push_frame
+from dipn_jax.networks.push_frame import PAPER, PushInput
 from dipn_jax.structs import ABSENT, Push
 from dipn_jax.workspace import grasp_angles
 
 SLOTS = 5
+VIEW = dipn.DipnConfig().view
+DISTANCES = np.tile(np.array([0.03, 0.05, 0.1], np.float32), (6, 1))
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +29,9 @@ def network() -> dipn.DIPN:
 
 @pytest.fixture(scope="module")
 def forward(network: dipn.DIPN) -> Any:
-    return nnx.jit(lambda inputs: network(inputs))
+    graph, state = nnx.split(network)
+    compiled = jax.jit(lambda inputs, distances: nnx.merge(graph, state)(inputs, distances))
+    return lambda inputs, distances=DISTANCES: compiled(inputs, distances)
 
 
 def _push(x: float = -0.1, y: float = 0.02, angle: float = 0.4, distance: float = 0.05) -> Push:
@@ -34,10 +39,10 @@ def _push(x: float = -0.1, y: float = 0.02, angle: float = 0.4, distance: float 
 
 
 @pytest.fixture(scope="module")
-def inputs(settled: Any) -> dipn.PushInput:
-    labels = jax.vmap(render.render_depth)(settled.scene, jnp.asarray(settled.poses))[1]
+def inputs(settled: Any) -> PushInput:
+    heights, labels = jax.vmap(render.render_depth)(settled.scene, jnp.asarray(settled.poses))
     pushes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (6, *leaf.shape)), _push())
-    return dipn.push_inputs(labels, pushes, slots=SLOTS, stride=2)[0]
+    return push_frame.push_inputs(labels, heights, pushes, slots=SLOTS, view=VIEW)[0]
 
 
 def test_the_push_starts_at_pixel_40_112_and_goes_to_plus_x() -> None:
@@ -48,10 +53,10 @@ def test_the_push_starts_at_pixel_40_112_and_goes_to_plus_x() -> None:
     for i, point in enumerate((push.start, ahead)):
         col, row = np.round(np.asarray(geometry.metres_to_pixels(point))).astype(int)
         label[row - 1 : row + 2, col - 1 : col + 2] = i
-    made, _ = dipn.push_input(jnp.array(label), push, slots=2, stride=1)
-    rows, cols = np.nonzero(np.asarray(made.scene_map))
+    made, _ = push_frame.push_input(jnp.array(label), jnp.zeros((224, 224)), push, slots=2)
+    rows, cols = np.nonzero(np.asarray(made.scene_map[..., 0]))
     first = cols < 50
-    np.testing.assert_allclose([cols[first].mean(), rows[first].mean()], dipn.START_PIXEL, atol=0.8)
+    np.testing.assert_allclose([cols[first].mean(), rows[first].mean()], push_frame.START_PIXEL, atol=0.8)
     np.testing.assert_allclose([cols[~first].mean(), rows[~first].mean()], [60, 112], atol=0.8)
     np.testing.assert_allclose(made.centers[1], [0.04, 0.0], atol=2e-3)
     box = np.asarray(made.push_map)
@@ -59,19 +64,25 @@ def test_the_push_starts_at_pixel_40_112_and_goes_to_plus_x() -> None:
 
 
 def test_the_push_frame_is_opencvs_warp(settled: Any) -> None:
-    _, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
+    height, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     push = _push()
-    made, _ = dipn.push_input(label, push, slots=SLOTS, stride=1)
+    made, centers = push_frame.push_input(label, height, push, slots=SLOTS)
     c, s = np.cos(0.4), np.sin(0.4)
     rotation = np.array([[c, -s], [s, c]])
-    offset = np.asarray(geometry.metres_to_pixels(push.start)) - rotation @ np.array(dipn.START_PIXEL)
+    offset = np.asarray(geometry.metres_to_pixels(push.start)) - rotation @ np.array(push_frame.START_PIXEL)
     warp = np.column_stack([rotation, offset])
     mask = (np.asarray(label) >= 0).astype(np.uint8)
     want = cv2.warpAffine(mask, warp, (224, 224), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
-    assert (np.asarray(made.scene_map) == want).mean() > 0.995
+    assert (np.asarray(made.scene_map[..., 0]) == want).mean() > 0.995
+    for i in range(SLOTS):  # crops: the same turn about the object's own centre
+        offset = np.asarray(geometry.metres_to_pixels(centers[i])) - rotation @ np.full(2, 29.5)
+        own = (np.asarray(label) == i).astype(np.uint8)
+        warp = np.column_stack([rotation, offset])
+        want = cv2.warpAffine(own, warp, (60, 60), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+        assert (np.asarray(made.crops[i, ..., 0]) == want).mean() > 0.99
 
 
-def test_crops_are_centred_on_their_own_object(inputs: dipn.PushInput) -> None:
+def test_crops_are_centred_on_their_own_object(inputs: PushInput) -> None:
     own = np.asarray(inputs.crops[..., 0])
     rows, cols = np.mgrid[:30, :30]
     for b in range(6):
@@ -84,14 +95,14 @@ def test_crops_are_centred_on_their_own_object(inputs: dipn.PushInput) -> None:
 
 def test_motion_round_trips_between_frames() -> None:
     motion = jnp.array([[0.01, -0.02, 0.3]])
-    back = dipn.to_workspace(dipn.from_workspace(motion, jnp.float32(0.7)), jnp.float32(0.7))
+    back = push_frame.to_workspace(push_frame.from_workspace(motion, jnp.float32(0.7)), jnp.float32(0.7))
     np.testing.assert_allclose(back, motion, atol=1e-6)
     # along the push is +x of the push frame
     along = 0.01 * jnp.array([[jnp.cos(0.7), jnp.sin(0.7), 0.0]])
-    np.testing.assert_allclose(dipn.from_workspace(along, jnp.float32(0.7)), [[5.0, 0.0, 0.0]], atol=1e-4)
+    np.testing.assert_allclose(push_frame.from_workspace(along, jnp.float32(0.7)), [[5.0, 0.0, 0.0]], atol=1e-4)
 
 
-def test_permuting_objects_permutes_the_output(forward: Any, inputs: dipn.PushInput) -> None:
+def test_permuting_objects_permutes_the_output(forward: Any, inputs: PushInput) -> None:
     order = np.array([3, 1, 4, 0, 2])
     mixed = inputs.replace(
         crops=inputs.crops[:, order], centers=inputs.centers[:, order], present=inputs.present[:, order]
@@ -99,7 +110,7 @@ def test_permuting_objects_permutes_the_output(forward: Any, inputs: dipn.PushIn
     np.testing.assert_allclose(forward(mixed), forward(inputs)[:, order], atol=1e-4)
 
 
-def test_objects_out_of_sight_change_nothing(forward: Any, inputs: dipn.PushInput) -> None:
+def test_objects_out_of_sight_change_nothing(forward: Any, inputs: PushInput) -> None:
     hidden = inputs.replace(present=inputs.present.at[:, 3:].set(False))
     other = hidden.replace(crops=hidden.crops.at[:, 3:].set(1.0), centers=hidden.centers.at[:, 3:].set(0.3))
     out = forward(hidden)
@@ -107,23 +118,41 @@ def test_objects_out_of_sight_change_nothing(forward: Any, inputs: dipn.PushInpu
     np.testing.assert_array_equal(out[:, 3:], 0.0)
 
 
-def test_batch_elements_do_not_interact(forward: Any, inputs: dipn.PushInput) -> None:
+def test_batch_elements_do_not_interact(forward: Any, inputs: PushInput) -> None:
     changed = jax.tree.map(lambda leaf: leaf.at[0].set(jnp.zeros_like(leaf[0])), inputs)
     np.testing.assert_allclose(forward(changed)[1:], forward(inputs)[1:], atol=1e-5)
 
 
-@pytest.mark.parametrize("stride", [1, 2])
-def test_the_mirror_of_an_input_is_the_input_of_the_mirror(stride: int, settled: Any) -> None:
+@pytest.mark.parametrize("view", [PAPER, VIEW])
+def test_the_mirror_of_an_input_is_the_input_of_the_mirror(view: push_frame.View, settled: Any) -> None:
     # a push along +x through the middle of the map: mirroring the scene is flipping the map's rows
-    _, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
+    height, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     push = _push(x=-0.143, y=0.0, angle=0.0)
-    make = functools.partial(dipn.push_input, slots=SLOTS, stride=stride)
-    direct = dipn.mirror(jax.tree.map(lambda leaf: leaf[None], make(label, push)[0]))
-    mirrored = jax.tree.map(lambda leaf: leaf[None], make(jnp.flip(label, 0), push)[0])
-    for name in ("scene_map", "crops"):
+    make = functools.partial(push_frame.push_input, slots=SLOTS, view=view)
+    direct = push_frame.mirror(jax.tree.map(lambda leaf: leaf[None], make(label, height, push)[0]))
+    flipped = make(jnp.flip(label, 0), jnp.flip(height, 0), push)[0]
+    mirrored = jax.tree.map(lambda leaf: leaf[None], flipped)
+    for name in ("push_map", "scene_map", "crops"):
         a, b = getattr(direct, name), getattr(mirrored, name)
-        assert np.mean(np.asarray(a) != np.asarray(b)) < 0.02, name
+        assert np.mean(np.abs(np.asarray(a) - np.asarray(b)) > 0.05) < 0.02, name
     np.testing.assert_allclose(direct.centers, mirrored.centers, atol=1e-3)
+
+
+def test_the_mirror_of_a_push_has_the_mirrored_outcome(network: dipn.DIPN, inputs: PushInput) -> None:
+    graph, state = nnx.split(network)
+    answer = jax.jit(lambda seen: dipn.symmetric(nnx.merge(graph, state), seen, DISTANCES))
+    there = answer(inputs)
+    assert np.abs(there).max() > 1e-3
+    np.testing.assert_allclose(answer(push_frame.mirror(inputs)), push_frame.mirror_motion(there), atol=1e-4)
+
+
+def test_a_distance_does_not_depend_on_which_others_are_asked(forward: Any, inputs: PushInput) -> None:
+    several = forward(inputs)
+    reversed_ = forward(inputs, DISTANCES[:, ::-1])
+    np.testing.assert_allclose(several, reversed_[:, :, ::-1], atol=1e-5)
+    assert np.abs(forward(inputs, np.zeros_like(DISTANCES))).max() == 0, "a push of no length moves nothing"
+    halfway = forward(inputs, np.tile(np.array([0.04, 0.05, 0.045], np.float32), (6, 1)))
+    np.testing.assert_allclose(halfway[:, :, 2], halfway[:, :, :2].mean(2), atol=1e-4)
 
 
 def test_compact_grasp_scores_are_of_the_pixel_they_stand_at() -> None:
@@ -173,11 +202,12 @@ def _one_step(model: Any, loss: Any) -> tuple[float, float]:
 @pytest.mark.slow
 def test_paper_dipn_takes_a_training_step(settled: Any) -> None:
     model = dipn.DIPN(dipn.DipnConfig(preset="paper"), rngs=nnx.Rngs(0))
-    _, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
-    made, _ = dipn.push_input(label, _push(), slots=SLOTS, stride=1)
+    height, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
+    made, _ = push_frame.push_input(label, height, _push(), slots=SLOTS)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
-    target = jnp.ones((2, SLOTS, 3))
-    before, after = _one_step(model, lambda m: losses.motion_loss(m(batch), target, batch.present))
+    target, distances = jnp.ones((2, SLOTS, 1, 3)), jnp.array([[0.05], [0.1]])
+    mask = batch.present[..., None]
+    before, after = _one_step(model, lambda m: losses.motion_loss(m(batch, distances), target, mask))
     assert np.isfinite(before) and after < before
 
 

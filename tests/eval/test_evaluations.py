@@ -5,12 +5,12 @@ import json
 import pathlib
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint, policy, render, scenes, structs
+from dipn_jax import checkpoint, clutter, policy, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
@@ -89,8 +89,9 @@ def test_a_case_that_does_not_come_to_rest_is_named(engine: Any, tmp_path: pathl
 def test_prediction_measures_the_baselines_as_they_are(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
+    network = {"dipn": checkpoint.load_network(runs["dipn"], network="dipn")}
     values, films = prediction.evaluate(
-        runs["dipn"], engine, CONFIG, Partial(tmp_path, {}), scenes=6, seed=3, physics=True
+        network, engine, CONFIG, Partial(tmp_path, {}), scenes=6, seed=3, physics=True, segmented=True
     )
     assert values["pushes"] == 6 and len(films["before"]) > 0
     # the engine with nominal mass and friction is nearer to the truth than nothing-moves
@@ -101,16 +102,21 @@ def test_prediction_measures_the_baselines_as_they_are(
 
 
 def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> None:
-    scene, poses = structs.take(settled.scene, 0), jnp.asarray(settled.poses[0])
-    after = poses.at[0, 0].add(0.01)
-    push = Push(jnp.zeros(2), jnp.float32(0.0), jnp.float32(0.05))
-    got = prediction._measurer(policy.static_predictor(5), 5)(scene, push, poses, after)
-    labels = [np.asarray(render.render_depth(scene, p)[1]) for p in (poses, after)]
-    for i in range(5):
-        a, b = labels[0] == i, labels[1] == i
-        want = 1 - (a & b).sum() / max((a | b).sum(), 1) if (a | b).any() else 0.0
-        np.testing.assert_allclose(got["one_minus_iou"][i], want, atol=1e-6)
-    assert got["moved"].tolist() == [bool((labels[0] == 0).any()), False, False, False, False]
+    seen = jax.tree.map(np.asarray, clutter.observe(settled.scene, settled.poses))
+    truth = np.repeat(settled.poses[:, None], 3, 1)
+    truth[:, 1:, 0, 0] += 0.01
+    after = prediction._labels_after(settled.scene, truth)
+    pushes = Push(np.zeros((6, 2), np.float32), np.zeros(6, np.float32), np.full(6, 0.05, np.float32))
+    rows: prediction.Rows = {}
+    static = {"static": prediction._at_distances(policy.static_predictor(5))}
+    prediction.measure(rows, "", static, seen, seen, pushes, truth, after, None)
+    for b in range(6):
+        for i in range(5):
+            was, is_ = seen.label[b] == i, after[b, 0] == i
+            either = (was | is_).sum()
+            want = 1 - (was & is_).sum() / either if either else 0.0
+            np.testing.assert_allclose(rows["static/push_error"][0][b, 0, i], want, atol=1e-6)
+        assert rows["moved"][0][b, 0].tolist() == [bool((seen.label[b] == 0).any()), False, False, False, False]
 
 
 def test_grasp_evaluation_writes_what_it_promises(
@@ -171,8 +177,9 @@ def test_every_table_ends_by_the_rules(cleared: Any) -> None:
 def test_the_report_is_one_file_with_its_pictures(
     cleared: Any, engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
+    network = {"dipn": checkpoint.load_network(runs["dipn"], network="dipn")}
     values, films = prediction.evaluate(
-        runs["dipn"], engine, CONFIG, Partial(tmp_path, {}), scenes=2, seed=3, physics=False
+        network, engine, CONFIG, Partial(tmp_path, {}), scenes=2, seed=3, physics=False, segmented=False
     )
     (tmp_path / "p").mkdir()
     np.savez_compressed(tmp_path / "p" / "films.npz", **films)  # type: ignore[arg-type]

@@ -1,0 +1,166 @@
+"""What DIPN sees of a push: all is moved rigidly so that the start is at pixel (40, 112) and the push goes to +x."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import candidates, geometry, losses
+from dipn_jax.structs import ABSENT, Push, Pytree
+from dipn_jax.workspace import GRIPPER, PUSH_STEPS, WORKSPACE
+
+START_PIXEL = (40.0, 112.0)  # col, row of the start in the push frame
+START_BOX = (40, 100, 65, 124)  # M_p: col, row of the corners of the white box
+CROP = 60  # pixels of an object's mask about its centre
+HEIGHT_UNIT = 0.05  # metres that are 1 in a height channel
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """How the maps and crops are sampled; the defaults are the published ones."""
+
+    map_stride: int = 1  # pixels between samples of the scene's map
+    crop: int = CROP  # pixels of a crop's side
+    crop_stride: int = 1  # pixels between its samples
+    context: bool = False  # crops also show the other objects, the sweep and heights, the map heights
+
+    @property
+    def map_side(self) -> int:
+        """Samples along a side of the map."""
+        return WORKSPACE.pixels // self.map_stride
+
+    @property
+    def crop_side(self) -> int:
+        """Samples along a side of a crop."""
+        return self.crop // self.crop_stride
+
+
+PAPER = View()
+
+
+@flax.struct.dataclass
+class PushInput(Pytree):
+    """What DIPN sees of one push, in the push frame; sides as in `View`, channels in brackets with `context`."""
+
+    push_map: jax.Array  # [M, M] float: M_p, or the swept rectangle
+    scene_map: jax.Array  # [M, M, 1 (2)] float: M_I, 1 on any object (height)
+    crops: jax.Array  # [N, C, C, 1 (5)] float: M_i about c_i (others, sweep, own height, others' height)
+    centers: jax.Array  # [N, 2] c_i, metres from the start
+    present: jax.Array  # [N] bool: objects in sight
+
+
+def _sweep(xy: jax.Array, distance: float) -> jax.Array:
+    """1 where the closed gripper passes; `xy [..., 2]` metres from the start, push frame."""
+    inside = (xy[..., 0] >= -GRIPPER.pad_width / 2) & (xy[..., 0] <= distance + GRIPPER.pad_width / 2)
+    return (inside & (jnp.abs(xy[..., 1]) <= GRIPPER.push_width / 2)).astype(jnp.float32)
+
+
+def push_ends(distance: jax.Array) -> jax.Array:
+    """Start and end `[..., 4]` of pushes by `distance [...]` metres, in units of the map's side."""
+    origin = np.array(START_PIXEL, np.float32) / WORKSPACE.pixels
+    end = origin[0] + distance / WORKSPACE.side
+    fixed = [jnp.full_like(end, value) for value in (*origin, origin[1])]
+    return jnp.stack([fixed[0], fixed[1], end, fixed[2]], -1)
+
+
+def push_input(
+    label: jax.Array, height: jax.Array, push: Push, *, slots: int, view: View = PAPER
+) -> tuple[PushInput, jax.Array]:
+    """Move what the camera sees into the frame of one push.
+
+    Args:
+      label: `[224, 224]` int32.
+      height: `[224, 224]` metres; looked at only with `context`.
+      push: one push.
+      slots: N.
+      view: how to sample.
+
+    Returns:
+      The network's input, and the mask centroids `[N, 2]` in the workspace (metres).
+    """
+    centers, area = candidates.mask_centers(label, slots)
+    start_offset = np.array(START_PIXEL, np.float32)
+    image = jnp.stack([label.astype(jnp.float32), height / HEIGHT_UNIT], -1) if view.context else label[..., None]
+
+    def sample(local: jax.Array) -> jax.Array:
+        there = geometry.rotate2d(local, push.angle) + push.start
+        return geometry.sample_nearest(image, geometry.metres_to_pixels(there), ABSENT)
+
+    stride = view.map_stride
+    pixel = geometry.view_grid(view.map_side, view.map_side) * stride + stride // 2  # the axis falls between two rows
+    local = (pixel - start_offset) * WORKSPACE.pixel
+    seen = sample(local)
+    occupied = seen[..., :1] != ABSENT
+    if view.context:
+        push_map = _sweep(local, PUSH_STEPS * 0.01)
+        scene_map = jnp.concatenate([occupied, jnp.where(occupied, seen[..., 1:], 0.0)], -1)
+    else:
+        col0, row0, col1, row1 = START_BOX
+        col, row = pixel[..., 0], pixel[..., 1]
+        push_map = (col >= col0) & (col <= col1) & (row >= row0) & (row <= row1)
+        scene_map = occupied
+    local_centers = geometry.rotate2d(centers - push.start, -push.angle)
+    about = geometry.view_grid(view.crop_side, view.crop_side) - (view.crop_side - 1) / 2
+    crop_local = local_centers[:, None, None] + about * view.crop_stride * WORKSPACE.pixel
+    crop = sample(crop_local)
+    own = crop[..., 0] == jnp.arange(slots)[:, None, None]
+    channels = [own]
+    if view.context:
+        other = (crop[..., 0] != ABSENT) & ~own
+        channels += [other, _sweep(crop_local, PUSH_STEPS * 0.01), own * crop[..., 1], other * crop[..., 1]]
+    inputs = PushInput(
+        push_map.astype(jnp.float32),
+        scene_map.astype(jnp.float32),
+        jnp.stack([c.astype(jnp.float32) for c in channels], -1),
+        local_centers,
+        area > 0,
+    )
+    return inputs, centers
+
+
+@functools.partial(jax.jit, static_argnames=("slots", "view"))
+def push_inputs(
+    labels: jax.Array, heights: jax.Array, pushes: Push, *, slots: int, view: View = PAPER
+) -> tuple[PushInput, jax.Array]:
+    """`push_input` over a batch: labels and heights `[B, 224, 224]`, pushes `[B]`."""
+    return jax.vmap(functools.partial(push_input, slots=slots, view=view))(labels, heights, pushes)
+
+
+def mirror(inputs: PushInput) -> PushInput:
+    """The same push seen in a mirror that holds its axis (batched or not).
+
+    At stride 1 row 112 of the map is the axis and has no counterpart for row 0: the maps are rolled by what
+    the flip shifts them.
+    """
+    axis = inputs.push_map.ndim - 2
+    shift = 1 if inputs.push_map.shape[axis] == WORKSPACE.pixels else 0
+    flip = lambda m: jnp.roll(jnp.flip(m, axis), shift, axis)  # noqa: E731
+    return inputs.replace(
+        push_map=flip(inputs.push_map),
+        scene_map=flip(inputs.scene_map),
+        crops=jnp.flip(inputs.crops, -3),
+        centers=inputs.centers * jnp.array([1.0, -1.0]),
+    )
+
+
+def mirror_motion(motion: jax.Array) -> jax.Array:
+    """Motions `[..., 3]` (push frame) seen in the same mirror."""
+    return motion * jnp.array([1.0, -1.0, -1.0])
+
+
+def to_workspace(motion: jax.Array, angle: jax.Array) -> jax.Array:
+    """Network output `[..., N, 3]` (pixels, degrees, push frame) to metres and radians, workspace; `angle [...]`."""
+    metric = motion / losses.PIXELS_DEGREES
+    shift = geometry.rotate2d(metric[..., :2], angle[..., None])
+    return jnp.concatenate([shift, metric[..., 2:]], -1)
+
+
+def from_workspace(motion: jax.Array, angle: jax.Array) -> jax.Array:
+    """Inverse of `to_workspace`."""
+    shift = geometry.rotate2d(motion[..., :2], -angle[..., None])
+    return jnp.concatenate([shift, motion[..., 2:]], -1) * losses.PIXELS_DEGREES

@@ -1,0 +1,150 @@
+"""Masks from an RGB-D image alone: what stands out of the table, cut where its colour changes. OpenCV, on the host."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from dipn_jax.errors import UserError
+from dipn_jax.structs import ABSENT, Array
+from dipn_jax.workspace import WORKSPACE
+
+TABLE_HEIGHT = 0.006
+"""Metres: what is lower and coloured like the table is table; a quarter of the lowest object."""
+SAME_COLOR = 22
+"""Levels of 255 by which each channel of one object may differ from its middle; palettes differ by more."""
+SMALLEST = 30
+"""Pixels (120 mm^2): smaller regions are fragments of their neighbours."""
+_GAP = 40  # pixels over which a hidden part is bridged: the widest object above
+_REACH = 4  # pixels over which a fragment goes to a neighbour
+_MOST_REGIONS = 200
+
+
+def segment(height: Array, color: Array, *, slots: int) -> np.ndarray:
+    """Instance masks of one image.
+
+    Args:
+      height: `[224, 224]` metres above the table.
+      color: `[224, 224, 3]` RGB in [0, 1].
+      slots: most masks wanted.
+
+    Returns:
+      `[224, 224]` int32: 0 for the largest mask, 1 for the next, ..., ABSENT on the table and where there are more
+      than `slots`. Objects of one colour that touch are one mask.
+
+    Raises:
+      UserError: another shape, or values that are not finite.
+    """
+    height, color = np.asarray(height, np.float32), np.asarray(color, np.float32)
+    side = WORKSPACE.pixels
+    if height.shape != (side, side) or color.shape != (side, side, 3):
+        raise UserError(
+            f"image of height {height.shape} and colour {color.shape}: want {(side, side)} and {(side, side, 3)}; "
+            "crop it to the workspace at 2 mm a pixel"
+        )
+    if not (np.isfinite(height).all() and np.isfinite(color).all()):
+        raise UserError("image: heights or colours that are not finite; fill holes in the depth first")
+    smooth = cv2.medianBlur(height, 3)
+    image = cv2.bilateralFilter(np.round(np.clip(color, 0, 1) * 255).astype(np.uint8), 5, 40, 2)
+    foreground = (smooth > TABLE_HEIGHT) | _off_table(image, smooth)
+    regions = _regions(image, foreground)
+    regions = _join(regions, image, smooth)
+    return _fill(regions, foreground, slots)
+
+
+def _off_table(image: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Low pixels that have not the table's colour: the foot of a slope."""
+    low = height <= TABLE_HEIGHT
+    if not low.any():
+        return low
+    table = np.median(image[low], 0)
+    return low & (np.abs(image - table).max(-1) > SAME_COLOR)
+
+
+def _regions(image: np.ndarray, foreground: np.ndarray) -> np.ndarray:
+    """Connected areas of one colour `[H, W]`: 1, 2, ...; 0 elsewhere. Each grows from the middle of what is left."""
+    regions = np.zeros(foreground.shape, np.int32)
+    left = foreground.astype(np.uint8)
+    for number in range(1, _MOST_REGIONS):
+        depth = cv2.distanceTransform(np.pad(left, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+        row, col = np.unravel_index(int(depth.argmax()), depth.shape)
+        if depth[row, col] < 1.5:  # nothing left but lines
+            break
+        closed = np.pad(1 - left, 1, constant_values=1).astype(np.uint8)  # 1: not to be entered
+        flags = 4 | cv2.FLOODFILL_FIXED_RANGE | cv2.FLOODFILL_MASK_ONLY | (2 << 8)
+        level = (SAME_COLOR,) * 3
+        cv2.floodFill(image, closed, (int(col), int(row)), (0, 0, 0), level, level, flags)
+        filled = closed[1:-1, 1:-1] == 2
+        left[filled] = 0
+        if filled.sum() >= SMALLEST:
+            regions[filled] = number
+    return regions
+
+
+def _join(regions: np.ndarray, image: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Regions of one colour are one object where only something higher lies between them."""
+    numbers = [n for n in np.unique(regions) if n]
+    mean = {n: np.median(image[regions == n], 0) for n in numbers}
+    for i, a in enumerate(numbers):
+        for b in numbers[i + 1 :]:
+            if np.abs(mean[a] - mean[b]).max() <= SAME_COLOR / 2 and _bridged(regions == a, regions == b, height):
+                regions = np.where(regions == b, a, regions)
+    return regions
+
+
+def _bridged(first: np.ndarray, second: np.ndarray, height: np.ndarray) -> bool:
+    """Whether the shortest line between two masks is short and passes under something higher than both of them."""
+    if not first.any() or not second.any():
+        return False
+    far, nearest = cv2.distanceTransformWithLabels(
+        (~first).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    row, col = np.unravel_index(int(np.where(second, far, np.inf).argmin()), far.shape)
+    if far[row, col] > _GAP:
+        return False
+    rows, cols = np.nonzero(first & (nearest == nearest[row, col]))
+    t = np.linspace(0, 1, int(far[row, col]) + 2)[1:-1]
+    line = height[np.round(row + t * (rows[0] - row)).astype(int), np.round(col + t * (cols[0] - col)).astype(int)]
+    ends = max(np.median(height[first]), np.median(height[second]))
+    return bool((line > ends - 0.002).mean() > 0.9)
+
+
+def _fill(regions: np.ndarray, foreground: np.ndarray, slots: int) -> np.ndarray:
+    """Labels by size; what is left of the foreground goes to the region beside it."""
+    far, nearest = cv2.distanceTransformWithLabels(
+        (regions == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    owner = np.zeros(int(nearest.max()) + 1, np.int32)
+    owner[nearest[regions > 0]] = regions[regions > 0]
+    full = np.where(foreground & (far <= _REACH), owner[nearest], 0)
+    numbers, sizes = np.unique(full[full > 0], return_counts=True)
+    order = numbers[np.argsort(-sizes, kind="stable")][:slots]
+    label = np.full(full.max() + 1, ABSENT, np.int32)
+    label[order] = np.arange(len(order))
+    return label[full]
+
+
+def match(found: np.ndarray, true: np.ndarray, *, slots: int) -> np.ndarray:
+    """Which found mask is which true one: the pair of the greatest IoU first, each mask once.
+
+    Args:
+      found: `[H, W]` int labels.
+      true: `[H, W]` int labels.
+      slots: labels are below.
+
+    Returns:
+      `[slots]` int: found label of each true one, ABSENT where none overlaps.
+    """
+    pair = np.zeros((slots + 1, slots + 1))
+    np.add.at(pair, (np.asarray(true).ravel(), np.asarray(found).ravel()), 1)  # ABSENT is the last row and column
+    both = pair[:slots, :slots]
+    either = pair.sum(1)[:slots, None] + pair.sum(0)[None, :slots] - both
+    iou = both / np.maximum(either, 1)
+    result = np.full(slots, ABSENT)
+    for _ in range(slots):
+        i, j = np.unravel_index(int(iou.argmax()), iou.shape)
+        if iou[i, j] <= 0:
+            break
+        result[i] = j
+        iou[i], iou[:, j] = 0, 0
+    return result
