@@ -58,7 +58,8 @@ def _off_table(image: np.ndarray, height: np.ndarray) -> np.ndarray:
     if not low.any():
         return low
     table = np.median(image[low], 0)
-    return low & (np.abs(image - table).max(-1) > SAME_COLOR)
+    same = cv2.inRange(image, np.ceil(table - SAME_COLOR), np.floor(table + SAME_COLOR))
+    return low & (same == 0)
 
 
 def _regions(image: np.ndarray, foreground: np.ndarray) -> np.ndarray:

@@ -48,7 +48,8 @@ class PushTask:
         episodes, fingerprint = records.load(data, kind="push")
         if without:
             classes = [shapes.CLASSES.index(name) for name in without]
-            episodes = structs.take(episodes, ~np.isin(episodes.scene.shape, classes).any(1))
+            kept = np.flatnonzero(~np.isin(episodes.scene.shape, classes).any(1))
+            episodes = structs.take(episodes, kept)
         count = len(episodes.fault)
         if limit is not None and not 2 <= limit <= count:
             raise UserError(f"--limit {limit}: want 2 to {count}, the number of episodes of {data} to use")
