@@ -62,9 +62,12 @@ def dipn_motions(
     Returns:
       `[P, K, N, 3]`: dx, dy (metres) of each mask's centroid, dtheta (radians), workspace.
     """
-    axis = None if observation.label.ndim == 2 else 0
-    make = functools.partial(push_frame.push_input, slots=slots, view=model.config.view)
-    inputs, _ = jax.vmap(make, in_axes=(axis, axis, 0))(observation.label, observation.height, pushes)
+    if observation.label.ndim == 2:
+        make = functools.partial(push_frame.push_input, slots=slots, view=model.config.view)
+        inputs, _ = jax.vmap(make, in_axes=(None, None, 0))(observation.label, observation.height, pushes)
+    else:
+        view = model.config.view
+        inputs, _ = push_frame.push_inputs(observation.label, observation.height, pushes, slots=slots, view=view)
     motion = dipn.symmetric(model, inputs, distances)
     return push_frame.to_workspace(motion.swapaxes(1, 2), pushes.angle[:, None])
 

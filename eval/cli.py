@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 import sys
 from typing import Annotated, Any, Literal
@@ -29,8 +30,17 @@ def _check(out: pathlib.Path, seed: int, **counts: int) -> None:
     console.require_out(out)
 
 
+def _plain(value: Any) -> Any:
+    """An option as JSON can hold it."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    return str(value) if isinstance(value, pathlib.Path) else value
+
+
 def _finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], partial: resume.Partial) -> None:
-    metrics.write(out, values, settings={k: str(v) if isinstance(v, pathlib.Path) else v for k, v in settings.items()})
+    metrics.write(out, values, settings={key: _plain(value) for key, value in settings.items()})
     partial.finish()
     for name, value in values.items():
         console.say(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")

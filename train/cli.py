@@ -28,7 +28,7 @@ def push(
     preset: Preset = "compact",
     steps: int = 1500,
     batch: int = 32,
-    learning_rate: float = 1e-3,
+    learning_rate: float = 3e-3,
     weight_decay: float = 1e-4,
     optimizer: Literal["adamw", "sgd"] = "adamw",
     seed: int = 0,

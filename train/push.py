@@ -72,9 +72,8 @@ class PushTask:
 
     def prepare(self, episodes: PushEpisode, centimetres: jax.Array) -> tuple[PushInput, jax.Array]:
         """Inputs `[B]` and targets `[B, N, K, 3]` (pixels, degrees, push frame) at `centimetres [B, K]`."""
-        return jax.vmap(functools.partial(example, slots=self.slots, view=self.network_config.view))(
-            episodes, centimetres
-        )
+        make = functools.partial(example, slots=self.slots, view=self.network_config.view)
+        return push_frame.over_batch(make, episodes, centimetres)
 
     def loss(self, model: nnx.Module, batch: PushEpisode, key: jax.Array) -> jax.Array:
         """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from dipn_jax.errors import UserError
-from dipn_jax.networks import push_frame, resnet
+from dipn_jax.networks import push_frame, resnet, stepwise
 from dipn_jax.networks.push_frame import PushInput, View
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 
@@ -20,12 +20,12 @@ class DipnConfig:
 
     preset: str = "compact"
     stages: tuple[int, ...] = (3, 4, 6, 3)  # paper: ResNet-50; the released code has (2, 2, 2, 2)
-    width: int = 32  # compact: channels of the first stage
+    width: int = 24  # compact: channels of the first stage
     features: int = 128  # compact: numbers an object, a scene and an interaction are
     rounds: int = 2  # compact: times that every object hears of every other
-    map_stride: int = 4  # compact: see View
-    crop: int = 60
-    crop_stride: int = 2
+    map_stride: int = 8  # compact: see View
+    crop: int = 64
+    crop_stride: int = 4
     context: bool = True
 
     def __post_init__(self) -> None:
@@ -76,59 +76,14 @@ class _Paper(nnx.Module):
         return self.motion(jnp.concatenate([scene, total], -1))
 
 
-class _CompactEncoder(nnx.Module):
-    """Pixels folded into channels, then three small stages; the last map is read out in place, not averaged."""
-
-    def __init__(self, features_in: int, fold: int, width: int, side: int, out: int, rngs: nnx.Rngs) -> None:
-        self.fold = fold
-        self.stem = resnet.conv(features_in * fold**2, width, 3, rngs)
-        self.block1 = resnet.PlainBlock(width, rngs)
-        self.down2 = resnet.conv(width, 2 * width, 3, rngs, stride=2)
-        self.block2 = resnet.PlainBlock(2 * width, rngs)
-        self.down3 = resnet.conv(2 * width, 2 * width, 3, rngs, stride=2)
-        half = lambda s: (s + 1) // 2  # noqa: E731
-        self.out = nnx.Linear(half(half(side // fold)) ** 2 * 2 * width, out, rngs=rngs)
-
-    def __call__(self, x: jax.Array) -> jax.Array:
-        x = self.block1(nnx.relu(self.stem(resnet.space_to_depth(x, self.fold))))
-        x = self.block2(nnx.relu(self.down2(x)))
-        x = nnx.relu(self.down3(x))
-        return nnx.relu(self.out(x.reshape(x.shape[0], -1)))
-
-
 class _Compact(nnx.Module):
-    """Small encoders, rounds of messages that know where the other object is, the whole course of the push at once.
-
-    The motion is read out at every centimetre and interpolated, so any number of distances costs one pass and
-    every example teaches all of them.
-    """
+    """`Stepwise`, read at any distance: every example teaches all of them, and any number of them costs one pass."""
 
     def __init__(self, config: DipnConfig, rngs: nnx.Rngs) -> None:
-        view, f = config.view, config.features
-        extra = 4 if view.context else 0
-        self.scene = _CompactEncoder(2 + view.context, 16 // view.map_stride, config.width, view.map_side, f, rngs)
-        self.item = _CompactEncoder(1 + extra, 3, config.width, view.crop_side, f, rngs)
-        self.center = resnet.MLP(2, (32, 32), rngs)
-        self.start = resnet.MLP(2 * f + 32, (f,), rngs)
-        self.message = nnx.List([resnet.MLP(2 * f + 3, (f, f), rngs) for _ in range(config.rounds)])
-        self.update = nnx.List([resnet.MLP(2 * f, (f, f), rngs, linear_end=True) for _ in range(config.rounds)])
-        self.motion = resnet.MLP(f, (2 * f, f, 3 * PUSH_STEPS), rngs, linear_end=True)
+        self.steps = stepwise.Stepwise(config.view, config.width, config.features, config.rounds, rngs)
 
     def __call__(self, inputs: PushInput, distances: jax.Array) -> jax.Array:
-        b, n = inputs.present.shape
-        scene = self.scene(_maps(inputs))
-        item = self.item(inputs.crops.reshape(b * n, *inputs.crops.shape[2:])).reshape(b, n, -1)
-        place = inputs.centers / 0.1
-        wide = jnp.broadcast_to(scene[:, None], (b, n, scene.shape[-1]))
-        state = self.start(jnp.concatenate([wide, item, self.center(place)], -1))
-        apart = place[:, None] - place[:, :, None]
-        apart = jnp.concatenate([apart, jnp.sqrt((apart**2).sum(-1, keepdims=True) + 1e-6)], -1)
-        others = _others(inputs.present)
-        for message, update in zip(self.message, self.update, strict=True):
-            heard = jnp.where(others, message(jnp.concatenate([*_pairs(state), apart], -1)), 0.0).sum(2)
-            state = state + update(jnp.concatenate([state, heard], -1))
-        course = 10 * self.motion(nnx.relu(state)).reshape(b, n, PUSH_STEPS, 3)
-        return _along(course, distances)
+        return _along(self.steps(inputs), distances)
 
 
 def _maps(inputs: PushInput) -> jax.Array:

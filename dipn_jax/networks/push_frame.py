@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import flax.struct
 import jax
@@ -18,6 +20,9 @@ START_PIXEL = (40.0, 112.0)  # col, row of the start in the push frame
 START_BOX = (40, 100, 65, 124)  # M_p: col, row of the corners of the white box
 CROP = 60  # pixels of an object's mask about its centre
 HEIGHT_UNIT = 0.05  # metres that are 1 in a height channel
+DIRECTIONS = 32
+"""In which outlines are known, evenly from +x toward +y."""
+_FAR = 10.0  # metres
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +32,9 @@ class View:
     map_stride: int = 1  # pixels between samples of the scene's map
     crop: int = CROP  # pixels of a crop's side
     crop_stride: int = 1  # pixels between its samples
-    context: bool = False  # crops also show the other objects, the sweep and heights, the map heights
+    context: bool = (
+        False  # crops also show the other objects, the sweep and heights, the map heights; outlines are found
+    )
 
     @property
     def map_side(self) -> int:
@@ -50,6 +57,7 @@ class PushInput(Pytree):
     push_map: jax.Array  # [M, M] float: M_p, or the swept rectangle
     scene_map: jax.Array  # [M, M, 1 (2)] float: M_I, 1 on any object (height)
     crops: jax.Array  # [N, C, C, 1 (5)] float: M_i about c_i (others, sweep, own height, others' height)
+    outlines: jax.Array  # [N, DIRECTIONS, 2] metres from c_i: see `outlines`; [N, 0, 2] without `context`
     centers: jax.Array  # [N, 2] c_i, metres from the start
     present: jax.Array  # [N] bool: objects in sight
 
@@ -117,10 +125,52 @@ def push_input(
         push_map.astype(jnp.float32),
         scene_map.astype(jnp.float32),
         jnp.stack([c.astype(jnp.float32) for c in channels], -1),
+        outlines(label, height, push.angle, centers) if view.context else jnp.zeros((slots, 0, 2)),
         local_centers,
         area > 0,
     )
     return inputs, centers
+
+
+def directions() -> np.ndarray:
+    """Unit vectors `[DIRECTIONS, 2]`."""
+    angle = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    return np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
+
+
+def outlines(label: jax.Array, height: jax.Array, angle: jax.Array, centers: jax.Array) -> jax.Array:
+    """Support functions of the masks: how far each reaches from its centroid, in directions turned by `angle`.
+
+    Args:
+      label: `[H, W]` int32.
+      height: `[H, W]` metres.
+      angle: `[]` radians.
+      centers: `[N, 2]` metres, workspace (`candidates.mask_centers`).
+
+    Returns:
+      `[N, DIRECTIONS, 2]` metres, pixel centres: of the whole mask, and of what is as high as the fingertips of a push.
+      0 where there is nothing.
+    """
+    x, y = ((jnp.arange(side) - (side - 1) / 2) * WORKSPACE.pixel for side in label.shape[::-1])
+    hot = label == jnp.arange(centers.shape[0])[:, None, None]
+    normal = geometry.rotate2d(directions(), angle)
+    found = []
+    for mask in (hot, hot & (height > GRIPPER.push_tip)):
+        high, low = jnp.where(mask, x, -_FAR).max(-1), jnp.where(mask, x, _FAR).min(-1)  # of each row
+        across = jnp.maximum(high[..., None] * normal[:, 0], low[..., None] * normal[:, 0])
+        reach = jnp.where((high > -_FAR)[..., None], across + y[:, None] * normal[:, 1], -_FAR).max(1)
+        found.append(jnp.where(reach > -_FAR / 2, reach - centers @ normal.T, 0.0))
+    return jnp.stack(found, -1)
+
+
+def over_batch(function: Callable[..., Any], *rows: Any) -> Any:
+    """`function` of each row of batched pytrees, jitted or not.
+
+    On a CPU one after the other, which keeps an image in the cache (2 times faster); all at once elsewhere.
+    """
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda row: function(*row), rows)
+    return jax.vmap(function)(*rows)
 
 
 @functools.partial(jax.jit, static_argnames=("slots", "view"))
@@ -128,7 +178,7 @@ def push_inputs(
     labels: jax.Array, heights: jax.Array, pushes: Push, *, slots: int, view: View = PAPER
 ) -> tuple[PushInput, jax.Array]:
     """`push_input` over a batch: labels and heights `[B, 224, 224]`, pushes `[B]`."""
-    return jax.vmap(functools.partial(push_input, slots=slots, view=view))(labels, heights, pushes)
+    return over_batch(functools.partial(push_input, slots=slots, view=view), labels, heights, pushes)
 
 
 def mirror(inputs: PushInput) -> PushInput:
@@ -144,6 +194,7 @@ def mirror(inputs: PushInput) -> PushInput:
         push_map=flip(inputs.push_map),
         scene_map=flip(inputs.scene_map),
         crops=jnp.flip(inputs.crops, -3),
+        outlines=jnp.roll(jnp.flip(inputs.outlines, -2), 1, -2),
         centers=inputs.centers * jnp.array([1.0, -1.0]),
     )
 
