@@ -23,10 +23,6 @@ class DipnConfig:
     width: int = 24  # compact: channels of the first stage
     features: int = 128  # compact: numbers an object, a scene and an interaction are
     rounds: int = 2  # compact: times that every object hears of every other
-    map_stride: int = 8  # compact: see View
-    crop: int = 64
-    crop_stride: int = 4
-    context: bool = True
 
     def __post_init__(self) -> None:
         if self.preset not in ("paper", "compact"):
@@ -35,9 +31,7 @@ class DipnConfig:
     @property
     def view(self) -> View:
         """What the network sees."""
-        if self.preset == "paper":
-            return push_frame.PAPER
-        return View(self.map_stride, self.crop, self.crop_stride, self.context)
+        return push_frame.PAPER if self.preset == "paper" else push_frame.COMPACT
 
 
 class _Paper(nnx.Module):
@@ -87,7 +81,7 @@ class _Compact(nnx.Module):
 
 
 def _maps(inputs: PushInput) -> jax.Array:
-    return jnp.concatenate([inputs.push_map[..., None], inputs.scene_map], -1)
+    return jnp.stack([inputs.push_map, inputs.scene_map], -1)
 
 
 def _pairs(items: jax.Array) -> list[jax.Array]:

@@ -27,37 +27,37 @@ _FAR = 10.0  # metres
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """How the maps and crops are sampled; the defaults are the published ones."""
+    """What a network is shown."""
 
-    map_stride: int = 1  # pixels between samples of the scene's map
-    crop: int = CROP  # pixels of a crop's side
-    crop_stride: int = 1  # pixels between its samples
-    context: bool = (
-        False  # crops also show the other objects, the sweep and heights, the map heights; outlines are found
-    )
-
-    @property
-    def map_side(self) -> int:
-        """Samples along a side of the map."""
-        return WORKSPACE.pixels // self.map_stride
+    crop: int  # pixels of a crop's side
+    stride: int  # pixels between its samples
+    context: bool  # no maps of the scene, but outlines, and crops that also show others, the sweep and heights
 
     @property
     def crop_side(self) -> int:
         """Samples along a side of a crop."""
-        return self.crop // self.crop_stride
+        return self.crop // self.stride
+
+    @property
+    def channels(self) -> int:
+        """Of a crop."""
+        return 5 if self.context else 1
 
 
-PAPER = View()
+PAPER = View(CROP, 1, context=False)
+"""As published."""
+COMPACT = View(64, 4, context=True)
+"""Coarse crops for what outlines do not tell: what lies on what, where the others are."""
 
 
 @flax.struct.dataclass
 class PushInput(Pytree):
-    """What DIPN sees of one push, in the push frame; sides as in `View`, channels in brackets with `context`."""
+    """What DIPN sees of one push, in the push frame; M is 224, C is `View.crop_side`; with `context`, M is 0."""
 
-    push_map: jax.Array  # [M, M] float: M_p, or the swept rectangle
-    scene_map: jax.Array  # [M, M, 1 (2)] float: M_I, 1 on any object (height)
-    crops: jax.Array  # [N, C, C, 1 (5)] float: M_i about c_i (others, sweep, own height, others' height)
-    outlines: jax.Array  # [N, DIRECTIONS, 2] metres from c_i: see `outlines`; [N, 0, 2] without `context`
+    push_map: jax.Array  # [M, M] float: M_p
+    scene_map: jax.Array  # [M, M] float: M_I, 1 on any object
+    crops: jax.Array  # [N, C, C, 1 or 5] float: M_i about c_i; with `context` others, sweep, own height, others' height
+    outlines: jax.Array  # [N, DIRECTIONS, 2] metres from c_i: see `outlines`; without `context` [N, 0, 2]
     centers: jax.Array  # [N, 2] c_i, metres from the start
     present: jax.Array  # [N] bool: objects in sight
 
@@ -77,7 +77,7 @@ def push_ends(distance: jax.Array) -> jax.Array:
 
 
 def push_input(
-    label: jax.Array, height: jax.Array, push: Push, *, slots: int, view: View = PAPER
+    label: jax.Array, height: jax.Array, push: Push, *, slots: int, view: View
 ) -> tuple[PushInput, jax.Array]:
     """Move what the camera sees into the frame of one push.
 
@@ -99,22 +99,17 @@ def push_input(
         there = geometry.rotate2d(local, push.angle) + push.start
         return geometry.sample_nearest(image, geometry.metres_to_pixels(there), ABSENT)
 
-    stride = view.map_stride
-    pixel = geometry.view_grid(view.map_side, view.map_side) * stride + stride // 2  # the axis falls between two rows
-    local = (pixel - start_offset) * WORKSPACE.pixel
-    seen = sample(local)
-    occupied = seen[..., :1] != ABSENT
     if view.context:
-        push_map = _sweep(local, PUSH_STEPS * 0.01)
-        scene_map = jnp.concatenate([occupied, jnp.where(occupied, seen[..., 1:], 0.0)], -1)
+        push_map = scene_map = jnp.zeros((0, 0))
     else:
+        pixel = geometry.view_grid(WORKSPACE.pixels, WORKSPACE.pixels)
+        scene_map = sample((pixel - start_offset) * WORKSPACE.pixel)[..., 0] != ABSENT
         col0, row0, col1, row1 = START_BOX
         col, row = pixel[..., 0], pixel[..., 1]
         push_map = (col >= col0) & (col <= col1) & (row >= row0) & (row <= row1)
-        scene_map = occupied
     local_centers = geometry.rotate2d(centers - push.start, -push.angle)
     about = geometry.view_grid(view.crop_side, view.crop_side) - (view.crop_side - 1) / 2
-    crop_local = local_centers[:, None, None] + about * view.crop_stride * WORKSPACE.pixel
+    crop_local = local_centers[:, None, None] + about * view.stride * WORKSPACE.pixel
     crop = sample(crop_local)
     own = crop[..., 0] == jnp.arange(slots)[:, None, None]
     channels = [own]
@@ -175,7 +170,7 @@ def over_batch(function: Callable[..., Any], *rows: Any) -> Any:
 
 @functools.partial(jax.jit, static_argnames=("slots", "view"))
 def push_inputs(
-    labels: jax.Array, heights: jax.Array, pushes: Push, *, slots: int, view: View = PAPER
+    labels: jax.Array, heights: jax.Array, pushes: Push, *, slots: int, view: View
 ) -> tuple[PushInput, jax.Array]:
     """`push_input` over a batch: labels and heights `[B, 224, 224]`, pushes `[B]`."""
     return over_batch(functools.partial(push_input, slots=slots, view=view), labels, heights, pushes)
@@ -184,12 +179,11 @@ def push_inputs(
 def mirror(inputs: PushInput) -> PushInput:
     """The same push seen in a mirror that holds its axis (batched or not).
 
-    At stride 1 row 112 of the map is the axis and has no counterpart for row 0: the maps are rolled by what
-    the flip shifts them.
+    Row 112 of the maps is the axis and has no counterpart for row 0, so they are rolled by what the flip shifts them;
+    so are the directions of the outlines.
     """
     axis = inputs.push_map.ndim - 2
-    shift = 1 if inputs.push_map.shape[axis] == WORKSPACE.pixels else 0
-    flip = lambda m: jnp.roll(jnp.flip(m, axis), shift, axis)  # noqa: E731
+    flip = lambda m: jnp.roll(jnp.flip(m, axis), 1, axis)  # noqa: E731
     return inputs.replace(
         push_map=flip(inputs.push_map),
         scene_map=flip(inputs.scene_map),

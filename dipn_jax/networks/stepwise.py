@@ -1,8 +1,7 @@
 """The body of the `compact` DIPN: a push followed two centimetres at a time, as a simulator would, with learnt forces.
 
 Each object is known by the outline of its mask: the support function h(phi), how far it reaches in each of a set of
-directions.
-Turning an object shifts that function; two convex outlines are apart by the largest of
+directions. Turning an object shifts that function; two convex outlines are apart by the largest of
 (c_j - c_i) . phi - h_i(phi) - h_j(phi + pi), so the network need not learn geometry, only what contact does.
 """
 
@@ -19,6 +18,8 @@ from dipn_jax.workspace import GRIPPER, PUSH_STEPS, WORKSPACE
 
 STRIDE = 2
 """Centimetres a step."""
+FOLD = 4
+"""Samples of a crop that are folded into one, along a side."""
 _NORMALS = push_frame.directions()
 _GRIPPER = (np.abs(_NORMALS) @ np.array([GRIPPER.pad_width / 2, GRIPPER.push_width / 2])).astype(np.float32)
 
@@ -45,11 +46,9 @@ class Stepwise(nnx.Module):
     """Positions, turns and a memory of every object, advanced by messages that know the gaps between outlines."""
 
     def __init__(self, view: View, width: int, features: int, rounds: int, rngs: nnx.Rngs) -> None:
-        self.view, f = view, features
-        channels, fold = 5, 4
-        self.fold = fold
-        small = (view.crop_side // fold + 1) // 2
-        self.stem = resnet.conv(channels * fold**2, width, 3, rngs)
+        f = features
+        small = (view.crop_side // FOLD + 1) // 2
+        self.stem = resnet.conv(view.channels * FOLD**2, width, 3, rngs)
         self.block = resnet.PlainBlock(width, rngs)
         self.down = resnet.conv(width, 2 * width, 3, rngs, stride=2)
         self.code = nnx.Linear(small**2 * 2 * width, f, rngs=rngs)
@@ -85,7 +84,7 @@ class Stepwise(nnx.Module):
         return jnp.concatenate(course, 2)
 
     def _encode(self, crops: jax.Array) -> jax.Array:
-        x = self.block(nnx.relu(self.stem(resnet.space_to_depth(crops, self.fold))))
+        x = self.block(nnx.relu(self.stem(resnet.space_to_depth(crops, FOLD))))
         x = nnx.relu(self.down(x))
         return nnx.relu(self.code(x.reshape(x.shape[0], -1)))
 
