@@ -149,3 +149,27 @@ def match(found: np.ndarray, true: np.ndarray, *, slots: int) -> np.ndarray:
         result[i] = j
         iou[i], iou[:, j] = 0, 0
     return result
+
+
+def find(height: Array, color: Array, true: Array, *, slots: int) -> tuple[np.ndarray, np.ndarray]:
+    """Masks found in one image, numbered as the objects that they overlap most; the rest take the numbers left over.
+
+    For training and measuring: what a network is shown is what the segmenter saw, and it is known of what.
+
+    Args:
+      height: `[224, 224]` metres above the table.
+      color: `[224, 224, 3]` RGB in [0, 1].
+      true: `[224, 224]` int labels.
+      slots: N.
+
+    Returns:
+      `[224, 224]` int32 labels, and which numbers are a mask of the object of that number, `[N]` bool.
+    """
+    found = segment(height, color, slots=slots)
+    matched = match(found, true, slots=slots)
+    renumbered = np.full(slots + 1, ABSENT, np.int32)  # the last: no segment
+    taken = np.flatnonzero(matched != ABSENT)
+    renumbered[matched[taken]] = taken
+    rest = np.setdiff1d(np.arange(slots), matched[taken])
+    renumbered[rest] = np.setdiff1d(np.arange(slots), taken)
+    return renumbered[found], matched != ABSENT

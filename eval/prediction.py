@@ -170,21 +170,9 @@ def _labels_after(scene: Scene, truth: np.ndarray) -> np.ndarray:
 
 
 def _found(seen: Observation, slots: int) -> np.ndarray:
-    """Labels `[B, H, W]` of masks found in the images, numbered as the objects that they overlap most.
-
-    The rest take the numbers left over, so that the network sees what the segmenter saw.
-    """
-    labels = []
-    for height, color, true in zip(seen.height, seen.color, seen.label, strict=True):
-        found = segment.segment(height, color, slots=slots)
-        matched = segment.match(found, true, slots=slots)
-        renumbered = np.full(slots + 1, structs.ABSENT)  # the last: no segment
-        taken = np.flatnonzero(matched != structs.ABSENT)
-        renumbered[matched[taken]] = taken
-        rest = np.setdiff1d(np.arange(slots), matched[taken])
-        renumbered[rest] = np.setdiff1d(np.arange(slots), taken)
-        labels.append(renumbered[found].astype(np.int32))
-    return np.stack(labels)
+    """Labels `[B, H, W]` of masks found in the images, numbered as the objects that they overlap most."""
+    images = zip(seen.height, seen.color, seen.label, strict=True)
+    return np.stack([segment.find(*image, slots=slots)[0] for image in images])
 
 
 def measure(

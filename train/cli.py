@@ -35,6 +35,7 @@ def push(
     limit: int | None = None,
     centimetres: tuple[int, ...] = tuple(range(1, 11)),
     without: tuple[ShapeClass, ...] = (),
+    masks: Literal["true", "found"] = "true",
     eval_every: int = 250,
     save_every: int = 250,
 ) -> None:
@@ -54,14 +55,17 @@ def push(
       weight_decay: decay.
       optimizer: adamw with cosine decay, or sgd with momentum 0.9.
       seed: seed of weights, order and augmentation.
-      limit: use only the first so many episodes.
+      limit: learn from the first so many episodes only; what is held out stays the same.
       centimetres: push distances learnt.
       without: leave out scenes with an object of these classes, to see how well they are guessed.
+      masks: true: the simulator's; found: cut out of the rendered image by colour and height.
       eval_every: steps between points of the learning curve.
       save_every: steps between checkpoints.
     """
     config = TrainConfig(steps, batch, learning_rate, weight_decay, optimizer, seed, eval_every, save_every)
-    task = PushTask(data, DipnConfig(preset=preset), limit=limit, centimetres=centimetres, without=without)
+    network = DipnConfig(preset=preset)
+    found = masks == "found"
+    task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found)
     _fit(task, config, out)
 
 

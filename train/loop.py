@@ -44,15 +44,15 @@ class Task(Protocol):
     network: str  # key of checkpoint.NETWORKS
     network_config: Any
     size: int  # training examples
-    examples: int  # with those held out
+    examples: int  # what a learning curve counts
     fingerprint: str  # of the data
 
     def fetch(self, index: np.ndarray) -> Any:
-        """The raw examples `index [B]`, on the host."""
+        """The examples `index [B]`."""
         ...
 
     def loss(self, model: nnx.Module, batch: Any, key: jax.Array) -> jax.Array:
-        """Loss of a raw batch; renders what the network sees, inside jit."""
+        """Loss of a batch of examples, inside jit."""
         ...
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:

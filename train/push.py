@@ -6,18 +6,28 @@ import functools
 import pathlib
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import geometry, losses, records, render, shapes, structs
+from dipn_jax import clutter, console, geometry, losses, records, render, segment, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, push_frame
 from dipn_jax.networks.push_frame import PushInput, View
-from dipn_jax.structs import PushEpisode
+from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from train.split import split
+
+
+@flax.struct.dataclass
+class Example(Pytree):
+    """What one push teaches; K distances."""
+
+    inputs: PushInput
+    target: Array  # [N, K, 3]: pixels, pixels, degrees, push frame
+    taught: Array  # [N, K] bool: masks of objects of which the push says where they go, distances that it reaches
 
 
 class PushTask:
@@ -33,15 +43,17 @@ class PushTask:
         limit: int | None,
         centimetres: tuple[int, ...],
         without: tuple[str, ...] = (),
+        found: bool = False,
     ) -> None:
         """Load a data set.
 
         Args:
           data: folder of push episodes.
           config: architecture.
-          limit: use only the first so many episodes.
+          limit: learn from the first so many episodes only; what is held out stays the same.
           centimetres: distances learnt, each 1 to 10.
           without: leave out scenes with an object of these classes (`shapes.CLASSES`).
+          found: masks are found in the image by `segment`, not taken from the simulator.
         """
         if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
             raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
@@ -50,45 +62,72 @@ class PushTask:
             classes = [shapes.CLASSES.index(name) for name in without]
             kept = np.flatnonzero(~np.isin(episodes.scene.shape, classes).any(1))
             episodes = structs.take(episodes, kept)
-        count = len(episodes.fault)
-        if limit is not None and not 2 <= limit <= count:
-            raise UserError(f"--limit {limit}: want 2 to {count}, the number of episodes of {data} to use")
-        count = count if limit is None else limit
-        self.train_set, self.test_set = split(structs.take(episodes, slice(0, count)), data)
-        self.network_config = config
-        self.size, self.examples = len(self.train_set.fault), count
-        self.fingerprint = ":".join(map(str, (fingerprint, count, centimetres, *without)))
-        self.centimetres = np.array(centimetres, np.int32)
-        self.slots = episodes.scene.shape.shape[1]
         shortest = 100 * float(np.min(episodes.push.distance))
         if min(centimetres) > shortest + 0.01:
             raise UserError(
                 f"--centimetres {centimetres}: {data} has pushes of {shortest:.0f} cm; give as low a number"
             )
+        learnt, self.test_set = split(episodes, data)
+        count = len(learnt.fault)
+        if limit is not None and not 1 <= limit <= count:
+            raise UserError(f"--limit {limit}: want 1 to {count}, the pushes of {data} that are not held out")
+        count = count if limit is None else limit
+        self.train_set = structs.take(learnt, slice(0, count))
+        self.network_config = config
+        self.size = self.examples = count
+        masks = ("found",) if found else ()
+        self.fingerprint = ":".join(map(str, (fingerprint, count, centimetres, *without, *masks)))
+        self.centimetres = np.array(centimetres, np.int32)
+        self.found = found
+        self.slots = episodes.scene.shape.shape[1]
+        self._kept: Example | None = None
+        self._held_out: Example | None = None
 
-    def fetch(self, index: np.ndarray) -> PushEpisode:
-        """See `loop.Task`."""
-        return structs.take(self.train_set, index)
+    def fetch(self, index: np.ndarray) -> Example:
+        """See `loop.Task`. A `compact` network's examples are small, and kept once they have been rendered."""
+        if self.network_config.preset == "paper":
+            return self.prepare(structs.take(self.train_set, index))
+        if self._kept is None:
+            self._kept = self._prepare_all(self.train_set)
+        return structs.take(self._kept, index)
 
-    def prepare(self, episodes: PushEpisode, centimetres: jax.Array) -> tuple[PushInput, jax.Array]:
-        """Inputs `[B]` and targets `[B, N, K, 3]` (pixels, degrees, push frame) at `centimetres [B, K]`."""
-        make = functools.partial(example, slots=self.slots, view=self.network_config.view)
-        return push_frame.over_batch(make, episodes, centimetres)
+    def prepare(self, episodes: PushEpisode) -> Example:
+        """Examples `[B]` of episodes `[B]`; rendered, and moved into the push frame, on the device."""
+        label, height, color = _look(episodes)
+        counted = np.ones(episodes.scene.shape.shape, bool)
+        if self.found:
+            images = zip(*map(np.asarray, (height, color, label)), strict=True)
+            each = [segment.find(*image, slots=self.slots) for image in images]
+            label, counted = np.stack([one[0] for one in each]), np.stack([one[1] for one in each])
+        view = self.network_config.view
+        return _examples(label, height, episodes, counted, self.centimetres, slots=self.slots, view=view)
 
-    def loss(self, model: nnx.Module, batch: PushEpisode, key: jax.Array) -> jax.Array:
+    def _prepare_all(self, episodes: PushEpisode) -> Example:
+        """Examples of a whole set, in memory on the host: about 20 KB a push of seven objects."""
+        parts, count = [], len(episodes.fault)
+        with console.Progress("render examples", count, unit="pushes") as progress:
+            for begin in range(0, count, clutter.BATCH):
+                rows = np.arange(begin, begin + clutter.BATCH) % count
+                part: Example = structs.take(self.prepare(structs.take(episodes, rows)), slice(0, count - begin))
+                parts.append(part.replace(inputs=part.inputs.replace(crops=part.inputs.crops.astype(np.float16))))
+                progress.advance(len(part.taught), "")
+        return structs.concatenate(parts)
+
+    def loss(self, model: nnx.Module, batch: Example, key: jax.Array) -> jax.Array:
         """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored.
 
         `compact` is taught every distance by every example, `paper`, which has one output, a random one.
         """
-        count = batch.fault.shape[0]
+        count = batch.taught.shape[0]
         distance_key, mirror_key = jax.random.split(key)
-        taught = self._recorded(batch)
+        inputs, target, taught = _single(batch.inputs), batch.target, batch.taught
+        centimetres = jnp.broadcast_to(self.centimetres, (count, len(self.centimetres)))
         if self.network_config.preset == "paper":
-            drawn = jax.random.categorical(distance_key, jnp.log(taught.astype(jnp.float32)))
-            centimetres, taught = jnp.asarray(self.centimetres)[drawn][:, None], jnp.ones((count, 1), bool)
-        else:
-            centimetres = jnp.broadcast_to(self.centimetres, taught.shape)
-        inputs, target = self.prepare(batch, centimetres)
+            reached = taught.any(1)
+            drawn = jax.random.categorical(distance_key, jnp.log(reached.astype(jnp.float32)))[:, None]
+            centimetres = jnp.take_along_axis(centimetres, drawn, 1)
+            target = jnp.take_along_axis(target, drawn[:, None, :, None], 2)
+            taught = jnp.take_along_axis(taught, drawn[:, None], 2)
         flipped = jax.random.bernoulli(mirror_key, 0.5, (count,))
 
         def pick(mirrored: jax.Array, seen: jax.Array) -> jax.Array:
@@ -96,44 +135,79 @@ class PushTask:
 
         inputs = jax.tree.map(pick, push_frame.mirror(inputs), inputs)
         target = pick(push_frame.mirror_motion(target), target)
-        predicted = model(inputs, centimetres * 0.01)
-        return losses.motion_loss(predicted, target, inputs.present[..., None] & taught[:, None])
-
-    def _recorded(self, episodes: PushEpisode) -> jax.Array:
-        """Which of the distances learnt the pushes `[B]` reach: `[B, centimetres]` bool."""
-        return jnp.asarray(self.centimetres[None] * 0.01) <= jnp.asarray(episodes.push.distance)[:, None] + 1e-4
+        return losses.motion_loss(model(inputs, centimetres * 0.01), target, inputs.present[..., None] & taught)
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss, and position error of moved objects (mm), at the largest distance."""
         total: dict[str, list[Any]] = {"held_out_loss": [], "moved_error_mm": []}
         graph, state = nnx.split(model)
-        size = 32
-        for begin in range(0, len(self.test_set.fault), size):
-            index = np.arange(begin, begin + size) % len(self.test_set.fault)
-            weight = np.arange(begin, begin + size) < len(self.test_set.fault)
-            episodes = structs.take(self.test_set, index)
-            loss, error, moved = self._measure(graph, state, episodes, jnp.asarray(weight))
+        size, count = 32, len(self.test_set.fault)
+        if self._held_out is None and self.network_config.preset != "paper":
+            self._held_out = self._prepare_all(self.test_set)
+        for begin in range(0, count, size):
+            index = np.arange(begin, begin + size) % count
+            weight = np.arange(begin, begin + size) < count
+            if self._held_out is None:
+                examples = self.prepare(structs.take(self.test_set, index))
+            else:
+                examples = structs.take(self._held_out, index)
+            loss, error, moved = _measure(graph, state, examples, self.centimetres, jnp.asarray(weight))
             total["held_out_loss"].append((float(loss), int(weight.sum())))
             total["moved_error_mm"].append((float(error), float(moved)))
         return {name: sum(v * w for v, w in rows) / max(sum(w for _, w in rows), 1e-9) for name, rows in total.items()}
 
-    @functools.partial(jax.jit, static_argnums=(0, 1))
-    def _measure(self, graph: Any, state: Any, episodes: PushEpisode, weight: jax.Array) -> tuple[jax.Array, ...]:
-        model = nnx.merge(graph, state)
-        farthest = jnp.where(self._recorded(episodes), self.centimetres, 0).max(-1, keepdims=True)
-        inputs, target = self.prepare(episodes, farthest)
-        predicted = model(inputs, farthest * 0.01)
-        counted = inputs.present[..., None] & weight[:, None, None]
-        loss = losses.motion_loss(predicted, target, counted)
-        moved = losses.moved(target / losses.PIXELS_DEGREES) & counted
-        error = jnp.linalg.norm((predicted - target)[..., :2], axis=-1) / losses.PIXELS_DEGREES[0] * 1000
-        return loss, (error * moved).sum() / jnp.maximum(moved.sum(), 1), moved.sum()
+
+def _single(inputs: PushInput) -> PushInput:
+    """Crops in single precision, in which they are not kept."""
+    return inputs.replace(crops=inputs.crops.astype(jnp.float32))
 
 
-def example(episode: PushEpisode, centimetres: jax.Array, *, slots: int, view: View) -> tuple[PushInput, jax.Array]:
-    """One episode as input and targets `[N, K, 3]` (pixels, degrees, push frame) after `centimetres [K]`."""
-    before = episode.poses[0]
-    height, label = render.render_depth(episode.scene, before)
-    inputs, centers = push_frame.push_input(label, height, episode.push, slots=slots, view=view)
-    motion = jax.vmap(lambda after: geometry.planar_motion(before, after, centers))(episode.poses[centimetres])
-    return inputs, push_frame.from_workspace(motion, episode.push.angle).swapaxes(0, 1)
+@functools.partial(jax.jit, static_argnums=0)
+def _measure(
+    graph: Any, state: Any, batch: Example, centimetres: jax.Array, weight: jax.Array
+) -> tuple[jax.Array, ...]:
+    """Loss, error (mm) and number of moved objects at the largest distance of each push."""
+    inputs = _single(batch.inputs)
+    farthest = jnp.where(batch.taught.any(1), centimetres, 0).argmax(-1)[:, None]
+    predicted = nnx.merge(graph, state)(inputs, centimetres[farthest] * 0.01)
+    target = jnp.take_along_axis(batch.target, farthest[:, None, :, None], 2)
+    taught = jnp.take_along_axis(batch.taught, farthest[:, None], 2)
+    counted = inputs.present[..., None] & weight[:, None, None] & taught
+    loss = losses.motion_loss(predicted, target, counted)
+    moved = losses.moved(target / losses.PIXELS_DEGREES) & counted
+    error = jnp.linalg.norm((predicted - target)[..., :2], axis=-1) / losses.PIXELS_DEGREES[0] * 1000
+    return loss, (error * moved).sum() / jnp.maximum(moved.sum(), 1), moved.sum()
+
+
+@jax.jit
+def _look(episodes: PushEpisode) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Labels, heights and colours `[B, ...]` before the pushes."""
+
+    def one(episode: PushEpisode) -> tuple[jax.Array, jax.Array, jax.Array]:
+        seen = render.render(episode.scene, episode.poses[0])
+        return seen.label, seen.height, seen.color
+
+    return push_frame.over_batch(one, episodes)
+
+
+@functools.partial(jax.jit, static_argnames=("slots", "view"))
+def _examples(
+    label: jax.Array,
+    height: jax.Array,
+    episodes: PushEpisode,
+    counted: jax.Array,
+    centimetres: jax.Array,
+    *,
+    slots: int,
+    view: View,
+) -> Example:
+    """Examples `[B]` of what is seen `[B, H, W]` before pushes; `counted [B, N]` masks teach something."""
+
+    def one(label: jax.Array, height: jax.Array, episode: PushEpisode, counted: jax.Array) -> Example:
+        inputs, centers = push_frame.push_input(label, height, episode.push, slots=slots, view=view)
+        move = lambda after: geometry.planar_motion(episode.poses[0], after, centers)  # noqa: E731
+        motion = push_frame.from_workspace(jax.vmap(move)(episode.poses[centimetres]), episode.push.angle)
+        reached = centimetres * 0.01 <= episode.push.distance + 1e-4
+        return Example(inputs, motion.swapaxes(0, 1), counted[:, None] & reached)
+
+    return push_frame.over_batch(one, label, height, episodes, counted)

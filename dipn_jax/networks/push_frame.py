@@ -22,6 +22,8 @@ CROP = 60  # pixels of an object's mask about its centre
 HEIGHT_UNIT = 0.05  # metres that are 1 in a height channel
 DIRECTIONS = 32
 """In which outlines are known, evenly from +x toward +y."""
+OUTLINE_WINDOW = 96
+"""Pixels around a centroid that are searched for an outline: no mask of one object reaches farther."""
 _FAR = 10.0  # metres
 
 
@@ -146,16 +148,25 @@ def outlines(label: jax.Array, height: jax.Array, angle: jax.Array, centers: jax
       `[N, DIRECTIONS, 2]` metres, pixel centres: of the whole mask, and of what is as high as the fingertips of a push.
       0 where there is nothing.
     """
-    x, y = ((jnp.arange(side) - (side - 1) / 2) * WORKSPACE.pixel for side in label.shape[::-1])
-    hot = label == jnp.arange(centers.shape[0])[:, None, None]
     normal = geometry.rotate2d(directions(), angle)
-    found = []
-    for mask in (hot, hot & (height > GRIPPER.push_tip)):
-        high, low = jnp.where(mask, x, -_FAR).max(-1), jnp.where(mask, x, _FAR).min(-1)  # of each row
-        across = jnp.maximum(high[..., None] * normal[:, 0], low[..., None] * normal[:, 0])
-        reach = jnp.where((high > -_FAR)[..., None], across + y[:, None] * normal[:, 1], -_FAR).max(1)
-        found.append(jnp.where(reach > -_FAR / 2, reach - centers @ normal.T, 0.0))
-    return jnp.stack(found, -1)
+    middle = (np.array(label.shape[::-1]) - 1) / 2
+    corner = jnp.round(centers / WORKSPACE.pixel + middle - OUTLINE_WINDOW / 2).astype(jnp.int32)
+    corner = jnp.clip(corner, 0, np.array(label.shape[::-1]) - OUTLINE_WINDOW)
+    level = jnp.where(height > GRIPPER.push_tip, 2, 1)
+
+    def reach(slot: jax.Array, at: jax.Array, center: jax.Array) -> jax.Array:
+        cut = lambda image: jax.lax.dynamic_slice(image, (at[1], at[0]), (OUTLINE_WINDOW, OUTLINE_WINDOW))  # noqa: E731
+        tall = jnp.where(cut(label) == slot, cut(level), 0)
+        x, y = ((jnp.arange(OUTLINE_WINDOW) + at[k] - middle[k]) * WORKSPACE.pixel - center[k] for k in range(2))
+        found = []
+        for mask in (tall >= 1, tall >= 2):
+            high, low = jnp.where(mask, x, -_FAR).max(-1), jnp.where(mask, x, _FAR).min(-1)  # of each row
+            across = jnp.maximum(high[:, None] * normal[:, 0], low[:, None] * normal[:, 0])
+            farthest = jnp.where((high > -_FAR)[:, None], across + y[:, None] * normal[:, 1], -_FAR).max(0)
+            found.append(jnp.where(farthest > -_FAR / 2, farthest, 0.0))
+        return jnp.stack(found, -1)
+
+    return jax.vmap(reach)(jnp.arange(centers.shape[0]), corner, centers)
 
 
 def over_batch(function: Callable[..., Any], *rows: Any) -> Any:
