@@ -34,6 +34,13 @@ BENCHMARKS = {
     "compile.warm_over_cold": Benchmark(
         "first calls with a warm compilation cache over a cold one", "<= 0.3", "compilation:warm_over_cold"
     ),
+    "push_net.vs_torch": Benchmark(
+        "training samples a second of both DIPNs over the same in PyTorch, and memory", ">= 1", "push_net:vs_torch"
+    ),
+    "push_net.input_share": Benchmark(
+        "share of a training step of the compact DIPN that its inputs take", "<= 0.2", "push_net:input_share"
+    ),
+    "push_net.batched": Benchmark("64 candidate pushes in one call over a call for each", "none", "push_net:batched"),
     "rates": Benchmark("episodes a second of each engine, 1 to 30 objects", "none", "rates:rates"),
 }
 

@@ -161,7 +161,7 @@ def clear(
     Args:
       grasp_net: run of dipn-train grasp.
       out: folder for metrics.json and every step of every table.
-      push_net: run of dipn-train push.
+      push_net: run of dipn-train push, or builtin.
       method: dipn+gn, or gn: grasps only.
       cases: hard (the ten hand-placed instances), random, or a case file of your own.
       names: only these cases of the file.
@@ -194,7 +194,9 @@ def clear(
         tables = tables_to_clear.hard_instances(
             physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed
         )
-    inputs = [p for p in (push_net, grasp_net, None if cases == "random" else path) if p is not None]
+    inputs = [grasp_net, *([] if cases == "random" else [path])]
+    if push_net:
+        inputs.append(checkpoint.find(push_net, network="dipn"))
     partial = resume.Partial(out, settings, inputs=inputs)
     tables = clearing.clear(tables, physics, predictor, scorer, config, partial, seed=seed)
     clearing.save(tables, out)

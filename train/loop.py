@@ -60,7 +60,8 @@ class Task(Protocol):
         ...
 
 
-def _optimizer(config: TrainConfig) -> optax.GradientTransformation:
+def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
+    """The optimizer of a run, its schedule included."""
     if config.optimizer == "sgd":
         return optax.chain(
             optax.add_decayed_weights(config.weight_decay), optax.sgd(config.learning_rate, momentum=0.9)
@@ -78,11 +79,13 @@ def _split(model: nnx.Module) -> tuple[Any, Any, Any]:
     return parts
 
 
-def _make_step(task: Task, graph: Any, optimizer: optax.GradientTransformation) -> Callable[..., Any]:
+def make_step(task: Task, graph: Any, optimizer: optax.GradientTransformation) -> Callable[..., Any]:
+    """`(params, rest, moments, batch, key) -> (params, rest, moments, loss)`, jitted; the first three are donated."""
+
     @functools.partial(jax.jit, donate_argnums=(0, 1, 2))
     def step(params: Any, rest: Any, moments: Any, batch: Any, key: jax.Array) -> Any:
         def loss(p: Any) -> tuple[jax.Array, Any]:
-            model = nnx.merge(graph, p, rest)
+            model = nnx.merge(graph, p, rest, copy=True)  # variables of this trace, which may be written
             model.train()
             value = task.loss(model, batch, key)
             return value, _split(model)[2]
@@ -110,13 +113,13 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
       UserError: the folder holds a run of another config or on other data.
     """
     _check(config, out)
-    optimizer = _optimizer(config)
+    optimizer = make_optimizer(config)
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
     files.claim(out, _identity(task, config, initial))
     moments, begin = _resume(out, model, optimizer)
     graph, params, rest = _split(model)
     order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
-    step_fn = _make_step(task, graph, optimizer)
+    step_fn = make_step(task, graph, optimizer)
     log = _Log(out, begin)
     key = jax.random.key(config.seed)
     latest: dict[str, float] = {}

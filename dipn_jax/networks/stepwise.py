@@ -21,7 +21,8 @@ STRIDE = 2
 FOLD = 4
 """Samples of a crop that are folded into one, along a side."""
 _NORMALS = push_frame.directions()
-_GRIPPER = (np.abs(_NORMALS) @ np.array([GRIPPER.pad_width / 2, GRIPPER.push_width / 2])).astype(np.float32)
+GRIPPER_REACH = (np.abs(_NORMALS) @ np.array([GRIPPER.pad_width / 2, GRIPPER.push_width / 2])).astype(np.float32)
+"""Support function of the closed gripper that pushes to +x `[DIRECTIONS]`, metres."""
 
 
 def turn(reach: jax.Array, angle: jax.Array) -> jax.Array:
@@ -94,7 +95,7 @@ class Stepwise(nnx.Module):
         """Memory `[B, N, F]` and motion of each centimetre `[B, N, STRIDE, 3]`; `ahead [B, N, 2]` from the gripper."""
         b, n, _ = hidden.shape
         whole, tall = reach[..., 0], reach[..., 1]
-        gripper = [_near(gaps(ahead, _GRIPPER, each)) for each in (whole, tall)]
+        gripper = [_near(gaps(ahead, GRIPPER_REACH, each)) for each in (whole, tall)]
         seen = [hidden, 20 * reach.reshape(b, n, -1), *gripper, 10 * ahead]
         state = nnx.relu(self.node(jnp.concatenate(seen, -1)))
         offset = place[:, None] - place[:, :, None]  # from the first of a pair to the second

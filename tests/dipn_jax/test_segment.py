@@ -83,6 +83,15 @@ def test_match_takes_the_best_pair_first() -> None:
     assert segment.match(found, true, slots=3).tolist() == [2, 1, ABSENT]
 
 
+def test_found_masks_take_the_numbers_of_their_objects() -> None:
+    height, color = _boxes((10, 30, 10, 30, 0.05, 0.9), (50, 100, 50, 100, 0.05, 0.4), (150, 180, 150, 180, 0.05, 0.9))
+    true = np.full((224, 224), ABSENT)
+    true[10:30, 10:30], true[50:100, 50:100] = 2, 0  # the third box belongs to nothing
+    label, known = segment.find(height, color, true, slots=3)
+    assert known.tolist() == [True, False, True]
+    assert (label[15, 15], label[75, 75], label[165, 165]) == (2, 0, 1)
+
+
 def test_what_is_no_image_is_refused() -> None:
     height, color = _boxes()
     with pytest.raises(UserError, match="crop it to the workspace"):

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint
+from dipn_jax import candidates, checkpoint, geometry, render, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from train.grasp import GraspTask, PretrainTask
-from train.loop import TrainConfig, fit
+from train.loop import TrainConfig, fit, make_optimizer, make_step
 from train.push import PushTask
 
 SMALL = DipnConfig(width=8)
@@ -110,19 +110,22 @@ def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Pat
 
 @pytest.mark.slow
 def test_the_published_networks_take_their_tasks(data: dict[str, pathlib.Path]) -> None:
-    """Shapes only: the published forms are trained for a step in tests/dipn_jax/test_networks.py."""
+    """A whole step is traced, not compiled: the published forms learn in tests/dipn_jax/test_networks.py."""
     dipn, gn = DipnConfig(preset="paper"), GraspConfig(preset="paper")
     tasks = (
-        PushTask(data["push"], dipn, limit=None, centimetres=(5,)),
+        PushTask(data["push"], dipn, limit=None, centimetres=(5, 10)),
         PretrainTask(data["images"], gn),
         GraspTask(data["grasp"], gn),
     )
+    optimizer = make_optimizer(BRIEF)
     for task in tasks:
         model = nnx.eval_shape(lambda task=task: checkpoint.build(task.network, task.network_config))
-        graph, state = nnx.split(model)
-        batch = task.fetch(np.arange(2))
-        loss = jax.eval_shape(lambda s, t=task, g=graph, b=batch: t.loss(nnx.merge(g, s), b, jax.random.key(0)), state)
-        assert loss.shape == ()
+        graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
+        moments = jax.eval_shape(optimizer.init, params)
+        step = make_step(task, graph, optimizer)
+        after = jax.eval_shape(step, params, rest, moments, task.fetch(np.arange(2)), jax.random.key(0))
+        assert after[3].shape == ()
+        assert jax.tree.structure(after[:2]) == jax.tree.structure((params, rest))
 
 
 def test_a_hard_stop_inside_a_line_of_metrics_is_survived(task: PushTask, tmp_path: pathlib.Path) -> None:
@@ -137,6 +140,37 @@ def test_no_scene_is_on_both_sides_of_the_split(data: dict[str, pathlib.Path]) -
     task = GraspTask(data["grasp"], GraspConfig())
     scenes = [{size.tobytes() for size in part.scene.size} for part in (task.train_set, task.test_set)]
     assert not scenes[0] & scenes[1] and scenes[1]
+
+
+def test_an_example_is_what_the_camera_shows_and_the_push_does(task: PushTask) -> None:
+    index = np.array([3, 0])
+    kept, fresh = task.fetch(index), task.prepare(structs.take(task.train_set, index))
+    np.testing.assert_allclose(kept.inputs.crops, fresh.inputs.crops, atol=1e-3)  # kept in half precision
+    np.testing.assert_array_equal(kept.target, fresh.target)
+    episode = structs.take(task.train_set, 3)
+    _, label = render.render_depth(episode.scene, episode.poses[0])
+    centers, area = candidates.mask_centers(label, task.slots)
+    c, s = np.cos(episode.push.angle), np.sin(episode.push.angle)
+    for k, centimetres in enumerate((5, 10)):
+        motion = geometry.planar_motion(episode.poses[0], episode.poses[centimetres], centers)
+        along = (motion[:, 0] * c + motion[:, 1] * s) / 0.002
+        visible = np.asarray(area) > 0
+        np.testing.assert_allclose(kept.target[0, visible, k, 0], along[visible], atol=1e-2)
+    assert kept.taught.all()
+
+
+def test_masks_found_in_the_image_teach_the_same_of_the_same_objects(
+    task: PushTask, data: dict[str, pathlib.Path]
+) -> None:
+    found = PushTask(data["push"], SMALL, limit=None, centimetres=(5, 10), found=True)
+    assert found.fingerprint != task.fingerprint
+    index = np.arange(12)
+    there, here = task.fetch(index), found.fetch(index)
+    both = here.taught[..., 0] & there.inputs.present
+    assert both.sum() > 0.9 * there.inputs.present.sum()  # two of one colour that touch are one mask
+    apart = np.abs(here.target - there.target)[both]
+    assert np.median(apart) < 0.1 and (apart > 5).mean() < 0.05
+    assert np.abs(here.inputs.centers - there.inputs.centers)[both].max() < 0.05
 
 
 def test_nonsense_is_refused(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:

@@ -1,0 +1,155 @@
+"""DIPN: training against PyTorch, what its inputs cost, candidates in one call against one call each."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import pathlib
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from benchmarks import push_worker
+from benchmarks.harness import Setting, Skipped, alternate, quiet
+from datagen.generate import Job, generate
+from dipn_jax import candidates, checkpoint, clutter, policy, scenes, structs
+from dipn_jax.networks.dipn import DipnConfig
+from dipn_jax.physics import make_engine
+from train.loop import TrainConfig, make_optimizer, make_step
+from train.push import PushTask
+
+BATCHES = {"compact": 32, "paper": 8}
+"""Examples a step, the presets' own."""
+CANDIDATES, OBJECTS = 64, 10
+
+
+def _task(folder: str, preset: str, seed: int) -> PushTask:
+    """A training task on a small data set of 1 to 7 objects."""
+    data = pathlib.Path(folder) / "data"
+    with quiet():
+        generate(Job("push", scenes.parse_objects("paper"), 72, seed, 72, 3, "native"), data)
+    return PushTask(data, DipnConfig(preset=preset), limit=None, centimetres=tuple(range(1, 11)))
+
+
+class Worker:
+    """A `push_worker` process."""
+
+    def __init__(self, framework: str, preset: str, batch: int, file: pathlib.Path) -> None:
+        """Start it; the first step, which compiles, is not counted."""
+        command = [sys.executable, "-m", "benchmarks.push_worker", framework, preset, str(batch), str(file)]
+        root = pathlib.Path(__file__).parent.parent
+        self.process = subprocess.Popen(command, cwd=root, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.steps(1)
+
+    def steps(self, count: int) -> float:
+        """Seconds that so many steps take."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{count}\n")
+        self.process.stdin.flush()
+        return float(self._line())
+
+    def close(self) -> tuple[int, float]:
+        """Number of parameters, and peak memory in MiB."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        parameters, memory = self._line().split()
+        self.process.wait()
+        return int(parameters), float(memory)
+
+    def _line(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"{' '.join(map(str, self.process.args))}: ended early")  # type: ignore[arg-type]
+        return line
+
+
+def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of a training step in PyTorch over ours, and our peak memory over PyTorch's, same layers and inputs."""
+    if importlib.util.find_spec("torch") is None:
+        raise Skipped("PyTorch is not installed; run pip install torch (the extra `bench`)")
+    for preset, batch in BATCHES.items():
+        with tempfile.TemporaryDirectory() as name:
+            task = _task(name, preset, setting.seed)
+            examples = task.prepare(structs.take(task.train_set, np.arange(batch)))
+            arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
+            file = pathlib.Path(name) / "examples.npz"
+            np.savez(file, target=np.asarray(examples.target), **arrays)  # type: ignore[arg-type]
+            workers = [Worker(framework, preset, batch, file) for framework in ("jax", "torch")]
+            count = 1 if preset == "paper" else setting.pick(10, 40)
+            ours, theirs = alternate(
+                *[functools.partial(worker.steps, count) for worker in workers], repeats=setting.pick(3, 9)
+            )
+            (mine, memory), (others, their_memory) = [worker.close() for worker in workers]
+        if mine != others:
+            raise RuntimeError(f"{preset}: {mine} parameters against {others} in PyTorch: not the same network")
+        yield f"push_net.vs_torch/{preset}", theirs / ours
+        yield f"push_net.vs_torch/{preset}_samples_per_second", batch * count / ours
+        yield f"push_net.vs_torch/{preset}_memory", memory / their_memory
+
+
+def input_share(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of rendering a batch and moving it into the push frame, over that and a step; and once kept, over a step.
+
+    `/kept` is what training pays: examples of a `compact` network are rendered once and stay in memory.
+    """
+    batch = BATCHES["compact"]
+    with tempfile.TemporaryDirectory() as name:
+        task = _task(name, "compact", setting.seed)
+    rows = np.arange(batch)
+    episodes = structs.take(task.train_set, rows)
+    model = checkpoint.build("dipn", task.network_config)
+    with quiet():
+        kept = task.fetch(rows)
+    graph, *state = nnx.split(model, nnx.Param, ...)
+    optimizer = make_optimizer(TrainConfig())
+    state.append(optimizer.init(state[0]))
+    step, key = make_step(task, graph, optimizer), jax.random.key(setting.seed)
+    inner = 5
+
+    def prepare() -> None:
+        for _ in range(inner):
+            jax.block_until_ready(task.prepare(episodes))
+
+    def learn() -> None:
+        for _ in range(inner):
+            *state[:], loss = step(*state, kept, key)
+            loss.block_until_ready()
+
+    def fetch() -> None:
+        for _ in range(inner):
+            task.fetch(rows)
+
+    prepare()  # compiles
+    learn()
+    prepared, learnt = alternate(prepare, learn, repeats=setting.pick(5, 15))
+    fetched, again = alternate(fetch, learn, repeats=setting.pick(5, 15))
+    yield "push_net.input_share", prepared / (prepared + learnt)
+    yield "push_net.input_share/kept", fetched / (fetched + again)
+
+
+def batched(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of one call for each candidate over one call for all: 64 pushes of a scene of 10 objects."""
+    items = clutter.settled_exactly(jax.random.key(setting.seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
+    seen = jax.tree.map(lambda leaf: leaf[0], clutter.observe(items.scene, items.poses))
+    key = jax.random.key(setting.seed)
+    pushes, _ = candidates.sample_pushes(key, seen, count=CANDIDATES, slots=OBJECTS, distance=0.1)
+    network: Any = checkpoint.build("dipn", DipnConfig())
+    network.eval()
+    predict = jax.jit(policy.dipn_predictor(network, OBJECTS))
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], pushes) for i in range(CANDIDATES)]
+    together = lambda: jax.block_until_ready(predict(seen, pushes))  # noqa: E731
+    one_by_one = lambda: jax.block_until_ready([predict(seen, push) for push in each])  # noqa: E731
+    apart = jnp.concatenate(one_by_one())
+    if not np.allclose(together(), apart, atol=1e-3):
+        raise RuntimeError("one call and a call for each candidate disagree")
+    all_at_once, alone = alternate(together, one_by_one, repeats=setting.pick(5, 15))
+    yield "push_net.batched", alone / all_at_once
+    yield "push_net.batched/milliseconds", 1000 * all_at_once

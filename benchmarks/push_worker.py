@@ -1,0 +1,110 @@
+"""Trains one network in one framework, a few steps each time that it is asked to: a process of its own, so that its
+peak memory is its own.
+
+`python -m benchmarks.push_worker FRAMEWORK PRESET BATCH FILE.npz`: inputs `[B, ...]` and `target [B, N, 10, 3]` are in
+the file; a line with a number on standard input is answered by the seconds that so many steps took, the end of input by
+the number of parameters and the highest resident memory in MiB.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dipn_jax.workspace import PUSH_STEPS
+
+Step = Callable[[], None]
+RATE, MOMENTUM = 1e-3, 0.9
+FIELDS = ("push_map", "scene_map", "crops", "outlines", "centers", "present")
+
+
+def jax_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
+    """One step of SGD with momentum in JAX, and the number of parameters."""
+    import jax
+    import jax.numpy as jnp
+    import optax
+    from flax import nnx
+
+    from dipn_jax import checkpoint, losses
+    from dipn_jax.networks import dipn, push_frame
+
+    inputs = push_frame.PushInput(**{name: jnp.asarray(arrays[name]) for name in FIELDS})
+    model = checkpoint.build("dipn", dipn.DipnConfig(preset=preset))
+    model.train()
+    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
+    optimizer = optax.sgd(RATE, momentum=MOMENTUM)
+    state = [params, rest, optimizer.init(params)]
+    target = _target(preset, arrays["target"])
+    centimetres = np.broadcast_to(np.arange(PUSH_STEPS + 1 - target.shape[2], PUSH_STEPS + 1), target.shape[:3:2])
+
+    @jax.jit
+    def step(params: Any, rest: Any, moments: Any) -> Any:
+        def loss(p: Any) -> Any:
+            network = nnx.merge(graph, p, rest, copy=True)
+            predicted = network(inputs, jnp.asarray(centimetres) * 0.01)
+            value = losses.motion_loss(
+                predicted, jnp.asarray(target), jnp.broadcast_to(inputs.present[..., None], target.shape[:3])
+            )
+            return value, nnx.split(network, nnx.Param, ...)[2]  # type: ignore[misc]
+
+        (value, rest), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+        updates, moments = optimizer.update(gradient, moments, params)
+        return optax.apply_updates(params, updates), rest, moments, value
+
+    def run() -> None:
+        *state[:], value = step(*state)
+        value.block_until_ready()
+
+    return run, sum(leaf.size for leaf in jax.tree.leaves(params))
+
+
+def torch_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
+    """The same in PyTorch."""
+    import torch
+
+    from benchmarks import torch_push
+    from dipn_jax.networks.dipn import DipnConfig
+    from dipn_jax.physics import cores
+
+    torch.set_num_threads(cores())
+    made = {"paper": torch_push.Paper, "compact": torch_push.Compact}[preset](DipnConfig(preset=preset))
+    inputs = {name: torch.from_numpy(arrays[name]) for name in FIELDS}
+    target = torch.from_numpy(_target(preset, arrays["target"]))
+    weight = inputs["present"][..., None, None].float()
+    optimizer = torch.optim.SGD(made.parameters(), RATE, MOMENTUM)
+
+    def run() -> None:
+        optimizer.zero_grad()
+        error = torch.nn.functional.smooth_l1_loss(made(inputs), target, reduction="none")
+        ((error * weight).sum() / (weight.sum() * target.shape[2])).backward()
+        optimizer.step()
+
+    return run, sum(each.numel() for each in made.parameters())
+
+
+def _target(preset: str, target: np.ndarray) -> np.ndarray:
+    """What a network of this preset answers: `paper` one distance, `compact` all."""
+    return target[:, :, -1:] if preset == "paper" else target
+
+
+def main() -> None:
+    """Entry point of a worker."""
+    framework, preset, batch, file = sys.argv[1:]
+    with np.load(file) as stored:
+        arrays = {name: stored[name][: int(batch)] for name in stored}
+    step, parameters = {"jax": jax_step, "torch": torch_step}[framework](preset, arrays)
+    for line in sys.stdin:
+        begun = time.perf_counter()
+        for _ in range(int(line)):
+            step()
+        print(time.perf_counter() - begun, flush=True)
+    print(parameters, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, flush=True)
+
+
+if __name__ == "__main__":
+    main()
