@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from dipn_jax import checkpoint, console, scenes
+from dipn_jax import checkpoint, console, files, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import EngineName, make_engine
 from eval import clearing, grasping, metrics, prediction, resume
@@ -63,7 +63,8 @@ def predict(
       dipn-eval prediction --push-net runs/dipn --out results/prediction
       dipn-eval prediction --push-net builtin --density 1000 1500 --out results/heavier
 
-    Error against number of pushes, with a band over seeds (curve.png, and in metrics.json push_error/curve/PUSHES/...):
+    Error against number of pushes, with a band over seeds (curve-all.png, curve-all.md, and in
+    metrics.json push_error/curve/PUSHES/...):
       dipn-eval prediction --curve runs/curve/* --scenes 1000 --out results/curve
 
     Args:
@@ -106,6 +107,7 @@ def predict(
     if curve:
         for which in ("all", "moved"):
             curves.figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
+            files.write_atomically(out / f"curve-{which}.md", curves.table(values, which=which).encode())
     _finish(out, values, settings, partial)
 
 

@@ -93,3 +93,39 @@ def figure(values: dict[str, Any], *, which: str = "all") -> Any:
     axes[0].legend(fontsize=7, ncol=2)
     made.tight_layout()
     return made
+
+
+_SHOWN = (
+    ("push_error", "1 - IoU", 3),
+    ("push_error_paper_measure", "XOR / 2 true", 3),
+    ("push_error_segmented", "1 - IoU, masks from the image", 3),
+    ("push_position_mm", "mm", 2),
+    ("push_angle_deg", "degrees", 2),
+)
+
+
+def table(values: dict[str, Any], *, which: str = "all") -> str:
+    """The numbers of the figure, and more, as Markdown: mean and standard deviation over seeds.
+
+    Args:
+      values: metrics with `summary`'s keys and the baselines'.
+      which: all, or moved objects only.
+    """
+    begin = "push_error/curve/"
+    sizes = sorted({int(key[len(begin) :].split("/")[0]) for key in values if key.startswith(begin)})
+    named = [(f"DIPN, {size:,} pushes", f"curve/{size}", "/mean") for size in sizes]
+    named += [(f"`{name}`", name, "") for name in ("trans", "static", "physics")]
+    shown = [(measure, title, digits, c) for measure, title, digits in _SHOWN for c in DISTANCES]
+    shown = [row for row in shown if f"{row[0]}/trans/{row[3]}cm/{which}" in values]
+    lines = ["| " + " | ".join(["predictor", *(f"{title}, {c} cm" for _, title, _, c in shown)]) + " |"]
+    lines.append("| --- " * (len(shown) + 1) + "|")
+    for label, place, end in named:
+        cells = []
+        for measure, _, digits, c in shown:
+            key = f"{measure}/{place}/{c}cm/{which}"
+            cell = f"{values[key + end]:.{digits}f}" if key + end in values else ""
+            spread = f" ± {values[key + '/std']:.{digits}f}" if values.get(f"{key}/seeds", 0) > 1 else ""
+            cells.append(cell + spread)
+        if any(cells):
+            lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
