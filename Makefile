@@ -1,11 +1,12 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html (15 minutes on 2 cores)
 # make test   lint, types, tests
 # make bench  the figures of docs/benchmarks.md
+# make push-figures  those of docs/push-prediction.md
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: setup demo test lint bench clean-demo
+.PHONY: setup demo test lint bench push-figures clean-demo
 
 setup: .venv/.installed
 
@@ -39,6 +40,30 @@ lint: setup
 bench: setup
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'
 	$(BIN)/python -m benchmarks all --scale full --out benchmarks.json
+
+# learning curves and everything else on docs/push-prediction.md (four hours on 2 cores; goes on where it was stopped)
+PUSH := results/push
+TRAIN_PUSH := $(BIN)/dipn-train push --data $(PUSH)/data --eval-every 1000 --save-every 1000
+SHIFT := $(BIN)/dipn-eval prediction --push-net builtin --scenes 500 --no-segmented
+push-figures: setup
+	$(BIN)/dipn-datagen push --out $(PUSH)/data --episodes 52000
+	for seed in 0 1 2; do for run in 100:600 300:1000 500:1500 1000:2500 1500:3000 51000:10000; do \
+	  $(TRAIN_PUSH) --limit $${run%:*} --steps $${run#*:} --seed $$seed --out $(PUSH)/runs/$${run%:*}-$$seed || exit; \
+	done; done
+	$(BIN)/dipn-eval prediction --curve $(PUSH)/runs/* --scenes 1000 --objects paper --out $(PUSH)/curve
+	$(TRAIN_PUSH) --limit 1500 --steps 3000 --centimetres 5 --out $(PUSH)/only5
+	$(TRAIN_PUSH) --limit 1500 --steps 3000 --centimetres 10 --out $(PUSH)/only10
+	$(TRAIN_PUSH) --limit 1500 --steps 3000 --masks found --out $(PUSH)/found
+	for run in every:runs/1500-0 only5:only5 only10:only10 found:found; do \
+	  $(BIN)/dipn-eval prediction --push-net $(PUSH)/$${run#*:} --scenes 500 --objects paper --no-physics --out $(PUSH)/alone-$${run%:*} || exit; \
+	done
+	$(SHIFT) --objects paper --out $(PUSH)/shift-none
+	$(SHIFT) --objects paper --density 1000 1500 --out $(PUSH)/shift-heavier
+	$(SHIFT) --objects paper --density 100 200 --out $(PUSH)/shift-lighter
+	$(SHIFT) --objects paper --friction 0.1 0.2 --out $(PUSH)/shift-slipperier
+	$(SHIFT) --objects paper --friction 0.5 0.7 --out $(PUSH)/shift-stickier
+	$(SHIFT) --objects 8:15 --out $(PUSH)/shift-crowded
+	$(BIN)/python docs/push_prediction.py $(PUSH)
 
 clean-demo:
 	rm -rf $(DEMO)

@@ -1,0 +1,77 @@
+"""The figures of docs/push-prediction.md: `python docs/push_prediction.py RESULTS` after the commands on that page.
+
+Gathers RESULTS/{curve,alone,shift-*}/metrics.json in docs/push-prediction.json, copies the figures, prints the tables.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import shutil
+import sys
+from typing import Any
+
+from dipn_jax import console, files
+from eval import curve
+
+DOCS = pathlib.Path(__file__).parent
+SHIFTS = {
+    "shift-none": "as trained on",
+    "shift-heavier": "density 1,000 to 1,500 kg/m³ (250 to 750)",
+    "shift-lighter": "density 100 to 200 kg/m³",
+    "shift-slipperier": "friction 0.1 to 0.2 (0.28 to 0.42)",
+    "shift-stickier": "friction 0.5 to 0.7",
+    "shift-crowded": "8 to 15 objects (1 to 7)",
+}
+COLUMNS = [(measure, f"{c}cm", which) for measure in ("push_error",) for c in (5, 10) for which in ("all", "moved")]
+
+
+def shift_table(values: dict[str, Any]) -> str:
+    """Builtin network, floor and better baseline where the world is not what the network learnt from."""
+    titles = [f"{at}, {which}" for _, at, which in COLUMNS]
+    lines = ["| scenes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
+    for shift, title in SHIFTS.items():
+        for name in ("dipn", "physics", "trans"):
+            keys = [f"{shift}/{measure}/{name}/{at}/{which}" for measure, at, which in COLUMNS]
+            if all(key in values for key in keys):
+                cells = [f"{values[key]:.3f}" for key in keys]
+                lines.append(f"| {title} | {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def alone_table(values: dict[str, Any]) -> str:
+    """One network for every distance against one for each, and one taught by found masks; 1,500 pushes, seed 0."""
+    names = {"every": "one network for 1 to 10 cm", "only5": "trained for 5 cm", "only10": "trained for 10 cm"}
+    names["found"] = "1 to 10 cm, trained on masks found in the image"
+    columns = [(f"push_error{masks}", at, which) for masks in ("", "_segmented") for _, at, which in COLUMNS]
+    titles = [f"{at}, {which}{', found masks' * measure.endswith('segmented')}" for measure, at, which in columns]
+    lines = ["| network | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
+    for name, title in names.items():
+        cells = []
+        for measure, at, which in columns:
+            asked = not name.startswith("only") or at == f"{name.removeprefix('only')}cm"
+            cells.append(f"{values[f'alone-{name}/{measure}/dipn/{at}/{which}']:.3f}" if asked else "")
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def tables(values: dict[str, Any]) -> list[str]:
+    """All tables of the page."""
+    return [*(curve.table(values, which=which) for which in ("all", "moved")), alone_table(values), shift_table(values)]
+
+
+def main() -> None:
+    """Entry point."""
+    results = pathlib.Path(sys.argv[1])
+    values = files.read_json(results / "curve" / "metrics.json")
+    for folder in sorted([*results.glob("alone-*"), *results.glob("shift-*")]):
+        found = files.read_json(folder / "metrics.json")
+        values |= {f"{folder.name}/{key}": value for key, value in found.items() if key.startswith("push_")}
+    files.write_json(DOCS / "push-prediction.json", values)
+    for which in ("all", "moved"):
+        shutil.copy(results / "curve" / f"curve-{which}.png", DOCS / f"push-prediction-{which}.png")
+    for table in tables(values):
+        console.say(table)
+
+
+if __name__ == "__main__":
+    main()
