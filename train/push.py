@@ -61,6 +61,10 @@ class PushTask:
         if without:
             classes = [shapes.CLASSES.index(name) for name in without]
             kept = np.flatnonzero(~np.isin(episodes.scene.shape, classes).any(1))
+            if not len(kept):
+                raise UserError(
+                    f"--without {' '.join(without)}: leaves none of the pushes of {data}; name fewer classes"
+                )
             episodes = structs.take(episodes, kept)
         shortest = 100 * float(np.min(episodes.push.distance))
         if min(centimetres) > shortest + 0.01:

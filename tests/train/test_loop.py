@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import candidates, checkpoint, geometry, render, structs
+from dipn_jax import candidates, checkpoint, geometry, render, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
@@ -178,6 +178,8 @@ def test_nonsense_is_refused(data: dict[str, pathlib.Path], tmp_path: pathlib.Pa
         PushTask(data["push"], SMALL, limit=None, centimetres=(0, 5))
     with pytest.raises(UserError, match="--limit 1000"):
         PushTask(data["push"], SMALL, limit=1000, centimetres=(5,))
+    with pytest.raises(UserError, match="leaves none of the pushes"):
+        PushTask(data["push"], SMALL, limit=None, centimetres=(5,), without=shapes.CLASSES)
     with pytest.raises(UserError, match="holds push episodes, want grasp"):
         GraspTask(data["push"], GraspConfig())
     task = PushTask(data["push"], SMALL, limit=None, centimetres=(5,))
