@@ -74,7 +74,7 @@ def figure(values: dict[str, Any], *, which: str = "all") -> Any:
       which: all, or moved objects only.
     """
     made, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharex=True)
-    titles = ("1 - IoU", "XOR / (2 true), the measure the paper's code plots")
+    titles = ("1 - IoU", "XOR / (2 true)")
     for axis, measure, title in zip(axes, MEASURES[:2], titles, strict=True):
         begin = f"{measure}/curve/"
         sizes = sorted({int(key[len(begin) :].split("/")[0]) for key in values if key.startswith(begin)})
