@@ -8,6 +8,7 @@ the number of parameters and the highest resident memory in MiB.
 
 from __future__ import annotations
 
+import pathlib
 import resource
 import sys
 import time
@@ -92,6 +93,15 @@ def _target(preset: str, target: np.ndarray) -> np.ndarray:
     return target[:, :, -1:] if preset == "paper" else target
 
 
+def peak_memory() -> float:
+    """Highest resident memory of this process, MiB; `ru_maxrss` would also count the parent's before the fork."""
+    status = pathlib.Path("/proc/self/status")
+    if status.exists():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
 def main() -> None:
     """Entry point of a worker."""
     framework, preset, batch, file = sys.argv[1:]
@@ -103,7 +113,7 @@ def main() -> None:
         for _ in range(int(line)):
             step()
         print(time.perf_counter() - begun, flush=True)
-    print(parameters, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, flush=True)
+    print(parameters, peak_memory(), flush=True)
 
 
 if __name__ == "__main__":
