@@ -68,6 +68,8 @@ def save(
     for name, tree in parts.items():
         checkpointer.save(temporary / name, _flat(tree))
     checkpointer.wait_until_finished()
+    for marker in temporary.rglob("commit_success.txt"):  # Orbax writes there where the folder stood
+        marker.write_text("Checkpoint commit was successful\n")
     stored = sorted(p for p in temporary.rglob("*") if p.is_file())
     meta = {
         "format_version": FORMAT_VERSION,
