@@ -1,6 +1,6 @@
 """The figures of docs/push-prediction.md: `python docs/push_prediction.py RESULTS` after the commands on that page.
 
-Gathers RESULTS/{curve,alone,shift-*}/metrics.json in docs/push-prediction.json, copies the figures, prints the tables.
+Gathers RESULTS/{curve,alone-*,shift-*}/metrics.json in docs/push-prediction.json, copies the figures, prints the tables.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ SHIFTS = {
     "shift-stickier": "friction 0.5 to 0.7",
     "shift-crowded": "8 to 15 objects (1 to 7)",
 }
-COLUMNS = [(measure, f"{c}cm", which) for measure in ("push_error",) for c in (5, 10) for which in ("all", "moved")]
+COLUMNS = [(f"{c}cm", which) for c in curve.DISTANCES for which in ("all", "moved")]
 
 
 def shift_table(values: dict[str, Any]) -> str:
     """Builtin network, floor and better baseline where the world is not what the network learnt from."""
-    titles = [f"{at}, {which}" for _, at, which in COLUMNS]
+    titles = [f"{at}, {which}" for at, which in COLUMNS]
     lines = ["| scenes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
     for shift, title in SHIFTS.items():
         for name in ("dipn", "physics", "trans"):
-            keys = [f"{shift}/{measure}/{name}/{at}/{which}" for measure, at, which in COLUMNS]
+            keys = [f"{shift}/push_error/{name}/{at}/{which}" for at, which in COLUMNS]
             if all(key in values for key in keys):
                 cells = [f"{values[key]:.3f}" for key in keys]
                 lines.append(f"| {title} | {name} | " + " | ".join(cells) + " |")
@@ -42,7 +42,7 @@ def alone_table(values: dict[str, Any]) -> str:
     """One network for every distance against one for each, and one taught by found masks; 1,500 pushes, seed 0."""
     names = {"every": "one network for 1 to 10 cm", "only5": "trained for 5 cm", "only10": "trained for 10 cm"}
     names["found"] = "1 to 10 cm, trained on masks found in the image"
-    columns = [(f"push_error{masks}", at, which) for masks in ("", "_segmented") for _, at, which in COLUMNS]
+    columns = [(f"push_error{masks}", at, which) for masks in ("", "_segmented") for at, which in COLUMNS]
     titles = [f"{at}, {which}{', found masks' * measure.endswith('segmented')}" for measure, at, which in columns]
     lines = ["| network | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
     for name, title in names.items():

@@ -64,3 +64,8 @@ def test_the_builtin_network_knows_what_a_push_does(settled: Any, engine: Any) -
     error = np.linalg.norm((told - true)[..., :2], axis=-1)
     assert moved.sum() >= 4
     assert error[moved].mean() < 0.25 * np.linalg.norm(true[..., :2], axis=-1)[moved].mean()
+
+
+def test_the_builtin_network_names_no_folder_of_the_machine_that_made_it() -> None:
+    texts = [path.read_bytes() for path in checkpoint.find(pathlib.Path("builtin"), network="dipn").rglob("*.txt")]
+    assert texts and not any(b" /" in text for text in texts)
