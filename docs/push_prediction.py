@@ -1,6 +1,6 @@
 """The figures of docs/push-prediction.md: `python docs/push_prediction.py RESULTS` after the commands on that page.
 
-Gathers RESULTS/{curve,alone-*,shift-*}/metrics.json in docs/push-prediction.json, copies the figures, prints the tables.
+Gathers RESULTS/{curve,alone-*,shift-*}/metrics.json in docs/push-prediction.json; copies figures, prints tables.
 """
 
 from __future__ import annotations
