@@ -73,7 +73,7 @@ def torch_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
     from dipn_jax.physics import cores
 
     torch.set_num_threads(cores())
-    made = {"paper": torch_push.Paper, "compact": torch_push.Compact}[preset](DipnConfig(preset=preset))
+    made: Any = {"paper": torch_push.Paper, "compact": torch_push.Compact}[preset](DipnConfig(preset=preset))
     inputs = {name: torch.from_numpy(arrays[name]) for name in FIELDS}
     target = torch.from_numpy(_target(preset, arrays["target"]))
     weight = inputs["present"][..., None, None].float()

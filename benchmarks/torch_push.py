@@ -142,7 +142,7 @@ class Compact(nn.Module):
 
     def gaps(self, offset: Tensor, first: Tensor, second: Tensor) -> Tensor:
         """As `stepwise.gaps`, in the network's unit."""
-        gap = offset @ self.normals.T - first - torch.roll(second, DIRECTIONS // 2, -1)  # type: ignore[operator]
+        gap = offset @ self.normals.T - first - torch.roll(second, DIRECTIONS // 2, -1)
         return torch.clamp(gap, -0.04, 0.06) * 100
 
     def advance(
@@ -150,7 +150,7 @@ class Compact(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """As `Stepwise._advance`."""
         whole = reach[..., 0]
-        gripper = [self.gaps(ahead, self.gripper, reach[..., k]) for k in range(2)]  # type: ignore[arg-type]
+        gripper = [self.gaps(ahead, self.gripper, reach[..., k]) for k in range(2)]
         state = functional.relu(self.node(torch.cat([hidden, 20 * reach.flatten(2), *gripper, 10 * ahead], -1)))
         offset = place[:, None] - place[:, :, None]
         pair = torch.cat([self.gaps(offset, whole[:, :, None], whole[:, None]), 10 * offset], -1)
