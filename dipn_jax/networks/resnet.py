@@ -9,14 +9,55 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+SMALL = 4
+"""Pixels a side of a map up to which a convolution is written as one matrix product."""
+
+
+class Conv(nnx.Conv):
+    """`nnx.Conv` in the form that XLA differentiates fastest on a CPU; the same function and parameters.
+
+    Measured forward and backward on two cores: a 1x1 as a matrix product is 1.5 to 6 times as fast, a 3x3 of 512
+    channels on 56 maps of 2x2 pixels 70 times.
+    """
+
+    def __call__(self, x: jax.Array) -> jax.Array:  # type: ignore[override]
+        """`[B, H, W, C]` to `[B, H / stride, W / stride, features]`."""
+        kernel, bias = self.kernel[...], 0.0 if self.bias is None else self.bias[...]
+        size, step = kernel.shape[0], self.strides[0]  # type: ignore[index]
+        if kernel.shape[:2] == (1, 1):
+            return x[:, ::step, ::step] @ kernel[0, 0] + bias
+        if size == kernel.shape[1] and max(x.shape[1:3]) <= SMALL * step:
+            return _patches(x, size, step) @ kernel.reshape(-1, kernel.shape[-1]) + bias
+        return super().__call__(x)
+
+
+def _patches(x: jax.Array, size: int, step: int) -> jax.Array:
+    """Every `size` x `size` neighbourhood of a map, flattened: `[B, H / step, W / step, size^2 C]`."""
+    rows, cols = (side + 2 * (size // 2) - size + 1 for side in x.shape[1:3])
+    edge = (size // 2, size // 2)
+    x = jnp.pad(x, ((0, 0), edge, edge, (0, 0)))
+    shifted = [x[:, i : i + rows : step, j : j + cols : step] for i in range(size) for j in range(size)]
+    return jnp.concatenate(shifted, -1)
+
+
+def max_pool(x: jax.Array) -> jax.Array:
+    """The largest of 3 x 3 at stride 2. Written out: on a CPU XLA differentiates `nnx.max_pool` 12 times slower."""
+    for axis in (1, 2):
+        edges = [(0, 0)] * 4
+        edges[axis] = (1, 1)
+        padded, count = jnp.pad(x, edges, constant_values=-jnp.inf), x.shape[axis]
+        near = [jax.lax.slice_in_dim(padded, i, i + count, 2, axis) for i in range(3)]
+        x = functools.reduce(jnp.maximum, near)
+    return x
+
 
 def conv(
     features_in: int, features: int, size: int | tuple[int, int], rngs: nnx.Rngs, *, stride: int = 1, bias: bool = True
-) -> nnx.Conv:
+) -> Conv:
     """A `size` x `size` convolution, padded to keep the resolution (over `stride`)."""
     kernel = (size, size) if isinstance(size, int) else size
     pad = tuple((k // 2, k // 2) for k in kernel)  # a tuple: graph definitions are hashed
-    return nnx.Conv(features_in, features, kernel, strides=(stride, stride), padding=pad, use_bias=bias, rngs=rngs)
+    return Conv(features_in, features, kernel, strides=(stride, stride), padding=pad, use_bias=bias, rngs=rngs)
 
 
 class Bottleneck(nnx.Module):
@@ -66,7 +107,7 @@ class ResNet(nnx.Module):
     def __call__(self, x: jax.Array, mask: jax.Array | None = None) -> list[jax.Array]:
         mask = None if mask is None else mask[:, None, None, None]
         x = nnx.relu(self.stem_norm(self.stem(x), mask=mask))
-        x = nnx.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
+        x = max_pool(x)
         maps = []
         for row in self.blocks:
             for block in row:
@@ -80,8 +121,8 @@ class PlainBlock(nnx.Module):
 
     def __init__(self, features: int, rngs: nnx.Rngs) -> None:
         self.first = conv(features, features, 3, rngs)
-        zero = functools.partial(nnx.Conv, kernel_init=nnx.initializers.zeros)
-        self.second = zero(features, features, (3, 3), padding="SAME", rngs=rngs)
+        zero = functools.partial(Conv, kernel_init=nnx.initializers.zeros)
+        self.second = zero(features, features, (3, 3), strides=(1, 1), padding="SAME", rngs=rngs)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         return nnx.relu(x + self.second(nnx.relu(self.first(x))))
