@@ -12,9 +12,10 @@ import tyro
 
 from datagen import check
 from datagen.generate import Job, generate
-from dipn_jax import console, records, scenes
+from dipn_jax import checkpoint, console, policy, records, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import EngineName
+from dipn_jax.planner import Scorer
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
@@ -36,10 +37,18 @@ class Work:
 DEFAULT_WORK = Work()
 
 
-def _generate(kind: str, out: pathlib.Path, objects: str, ranges: scenes.Ranges, work: Work, **job: Any) -> None:
+def _generate(
+    kind: str,
+    out: pathlib.Path,
+    objects: str,
+    ranges: scenes.Ranges,
+    work: Work,
+    scorer: Scorer | None = None,
+    **job: Any,
+) -> None:
     scene = scenes.parse_objects(objects, ranges=ranges)
     made = Job(kind, scene, engine=work.engine, timestep=work.timestep, **job)
-    generate(made, out, part=work.shard, of=work.of)
+    generate(made, out, part=work.shard, of=work.of, scorer=scorer)
 
 
 def push(
@@ -72,7 +81,8 @@ def push(
       ranges: what random objects are drawn from.
       work: engine and share of the work.
     """
-    job = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions, "distances": distances}
+    job: dict[str, Any] = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions}
+    job["distances"] = distances
     _generate("push", out, objects, ranges, work, **job)
 
 
@@ -83,13 +93,19 @@ def grasp(
     seed: int = 0,
     actions: int = 6,
     shard_size: int = 600,
+    grasp_net: pathlib.Path | None = None,
+    guided: float = 0.5,
+    hard: float = 0.25,
     ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
-    """Grasp episodes: a settled scene, one grasp at a random foreground pixel and angle, held or not.
+    """Grasp episodes: a settled scene, one grasp, held or not.
 
-    3,000 episodes take about three minutes on two cores:
+    At random foreground pixels and angles; 3,000 episodes take about three minutes on two cores:
       dipn-datagen grasp --out data/grasp --episodes 3000
+
+    Half where a network would grasp, a quarter where it is unsure, the others random:
+      dipn-datagen grasp --grasp-net runs/gn-pretrained --out data/guided --episodes 12000
 
     Args:
       out: folder of the data set; asking again continues or extends it.
@@ -98,11 +114,20 @@ def grasp(
       seed: seed of everything random.
       actions: different grasps tried on each settled scene.
       shard_size: episodes in a file.
+      grasp_net: run of dipn-train, or builtin; none: all grasps are random.
+      guided: share of grasps that it scores high.
+      hard: share of grasps that it is unsure of.
       ranges: what random objects are drawn from.
       work: engine and share of the work.
     """
-    job = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions}
-    _generate("grasp", out, objects, ranges, work, **job)
+    job: dict[str, Any] = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions}
+    if grasp_net is None:
+        return _generate("grasp", out, objects, ranges, work, **job)
+    if not (guided >= 0 and hard >= 0 and 0 < guided + hard <= 1):
+        raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
+    network: Any = checkpoint.load_network(grasp_net, network="grasp")
+    job |= {"guided": guided, "hard": hard, "weights": checkpoint.digest(network)}
+    _generate("grasp", out, objects, ranges, work, scorer=policy.grasp_scorer(network), **job)
 
 
 def images(

@@ -12,6 +12,7 @@ import numpy as np
 
 from dipn_jax import candidates, clutter, primitives, render, scenes, structs
 from dipn_jax.physics import Engine
+from dipn_jax.planner import Scorer
 from dipn_jax.structs import (
     Fault,
     Grasp,
@@ -76,16 +77,32 @@ def _aim_pushes(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
     return jax.lax.map(one, (keys, scene, poses))
 
 
+@dataclasses.dataclass(frozen=True)
+class Guide:
+    """Which grasps are tried, besides random ones."""
+
+    scorer: Scorer
+    guided: float  # share of those that it believes in
+    hard: float  # share of those that it is unsure of
+
+
 def grasp_batch(
-    key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, actions: int, **_: Any
+    key: jax.Array,
+    engine: Engine,
+    config: scenes.SceneConfig,
+    *,
+    count: int,
+    actions: int,
+    guide: Guide | None = None,
+    **_: Any,
 ) -> Batch:
-    """`actions` grasps at random foreground pixels and angles on each of up to `count` settled scenes."""
+    """`actions` grasps on each of up to `count` settled scenes: at random foreground pixels and angles, or guided."""
     drop, aim = jax.random.split(key)
     items, counts = clutter.settled(drop, engine, config, count)
     n = len(items.fault)
     if not n:
         return Batch(None, counts)
-    grasps = aim_grasps(jax.random.split(aim, n), items.scene, items.poses, actions=actions)
+    grasps = aim_grasps(jax.random.split(aim, n), items.scene, items.poses, actions=actions, guide=guide)
     grasps = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     repeated = structs.take(items, np.repeat(np.arange(n), actions))
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
@@ -101,15 +118,20 @@ def grasp_batch(
     return _drop_unusable(episodes, counts)
 
 
-def aim_grasps(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> Grasp:
-    """Random grasps `[B, actions]` of the foreground seen of scenes `[B, N]` at `poses [B, N, 7]`."""
-    return clutter.in_chunks(functools.partial(_aim_grasps, actions=actions), keys, scene, poses)
+def aim_grasps(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int, guide: Guide | None = None) -> Grasp:
+    """Grasps `[B, actions]` of the foreground seen of scenes `[B, N]` at `poses [B, N, 7]`."""
+    return clutter.in_chunks(functools.partial(_aim_grasps, actions=actions, guide=guide), keys, scene, poses)
 
 
-@functools.partial(jax.jit, static_argnames="actions")
-def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int) -> Grasp:
+@functools.partial(jax.jit, static_argnames=("actions", "guide"))
+def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int, guide: Guide | None) -> Grasp:
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> Grasp:
-        return candidates.random_grasps(args[0], render.render(*args[1:]), count=actions)
+        seen = render.render(*args[1:])
+        if guide is None:
+            return candidates.random_grasps(args[0], seen, count=actions)
+        scores = guide.scorer(render.rgbd(seen)[None])[0]
+        shares = {"guided": guide.guided, "hard": guide.hard}
+        return candidates.sample_grasps(args[0], seen, scores, count=actions, **shares)
 
     return jax.lax.map(one, (keys, scene, poses))
 

@@ -18,6 +18,7 @@ from datagen import episodes
 from dipn_jax import console, files, records, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, EngineName, make_engine, resolve
+from dipn_jax.planner import Scorer
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.workspace import PUSH_STEPS
 
@@ -42,6 +43,9 @@ class Job:
     engine: EngineName = "auto"
     timestep: float | None = None  # seconds; the engine's own if None
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,)  # metres: each push is made once for every one of them
+    guided: float = 0.0  # share of grasps that a network believes in
+    hard: float = 0.0  # share of grasps that it is unsure of
+    weights: str = ""  # SHA-256 of that network
 
     def __post_init__(self) -> None:
         console.require_positive(episodes=self.episodes, shard_size=self.shard_size)
@@ -87,12 +91,16 @@ class _Tally:
             self.progress.advance(fresh, f"{self.counts['dropped_scenes']} scenes let fall; {said}")
 
 
-def shard(job: Job, index: int, engine: Engine, tally: _Tally) -> tuple[Any, dict[str, int]]:
+def shard(
+    job: Job, index: int, engine: Engine, tally: _Tally, scorer: Scorer | None = None
+) -> tuple[Any, dict[str, int]]:
     """The episodes of one shard and what was counted while making them."""
     want = job.size(index)
     key = jax.random.fold_in(jax.random.key(job.seed), index)
     make = episodes.MAKERS[job.kind]
     each = job.actions * (len(job.distances) if job.kind == "push" else 1)
+    guide = episodes.Guide(scorer, job.guided, job.hard) if scorer else None
+    options: dict[str, Any] = {"actions": job.actions, "distances": job.distances, "guide": guide}
     done: list[Any] = []
     counts: collections.Counter[str] = collections.Counter()
     have = empty = 0
@@ -100,7 +108,7 @@ def shard(job: Job, index: int, engine: Engine, tally: _Tally) -> tuple[Any, dic
         key, batch_key = jax.random.split(key)
         # a tenth more than needed, for scenes that are dropped
         count = min(engine.batch, int(1.1 * (want - have) / each) + 1)
-        batch = make(batch_key, engine, job.scene, count=count, actions=job.actions, distances=job.distances)
+        batch = make(batch_key, engine, job.scene, count=count, **options)
         counts.update(batch.counts)
         empty = empty + 1 if batch.episodes is None else 0
         if empty == MAX_ATTEMPTS:
@@ -113,11 +121,18 @@ def shard(job: Job, index: int, engine: Engine, tally: _Tally) -> tuple[Any, dic
     return structs.concatenate(done), dict(counts)
 
 
-def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1) -> None:
+def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1, scorer: Scorer | None = None) -> None:
     """Write the shards of `job` that are missing; `part` of `of` workers takes every `of`-th.
 
     Two shards are in the making at any time: while the engine steps one, the scenes of the other are drawn, built,
     looked at, sifted, encoded or written.
+
+    Args:
+      job: what the data set is a function of.
+      out: its folder.
+      part: number of this worker.
+      of: number of workers.
+      scorer: of `job.weights`, for guided and hard grasps.
 
     Raises:
       UserError: the folder holds a data set of another config.
@@ -133,18 +148,20 @@ def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1) -> None
     todo = [index for index in mine if not _written(out, index, job)]
     total = sum(map(job.size, mine))
     with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
-        _write_all(job, todo, out, engine, _Tally(progress))
+        _write_all(job, todo, out, engine, _Tally(progress), scorer)
     manifest = records.update_manifest(out)
     console.say(f"{out}: {manifest['episodes']} {job.kind} episodes in {len(manifest['shards'])} shards")
 
 
-def _write_all(job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tally: _Tally) -> None:
+def _write_all(
+    job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tally: _Tally, scorer: Scorer | None
+) -> None:
     """Make and write the shards `todo`, AT_ONCE at a time; the first error stops all."""
     # the content of a shard does not depend on how many others there are
     config = {key: value for key, value in job.describe().items() if key != "episodes"}
 
     def one(index: int) -> None:
-        made, counts = shard(job, index, engine, tally)
+        made, counts = shard(job, index, engine, tally, scorer)
         records.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
         records.update_manifest(out)
 

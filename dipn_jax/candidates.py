@@ -134,6 +134,38 @@ def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Gr
     return grasp_at(jnp.stack([rotation, pixel // width, pixel % width], -1), observation.height)
 
 
+def sample_grasps(
+    key: jax.Array, observation: Observation, scores: jax.Array, *, count: int, guided: Array, hard: Array
+) -> Grasp:
+    """`count` grasps of what a scorer thinks of: some it believes in, some it is unsure of, the others anywhere.
+
+    Args:
+      key: random key.
+      observation: `[H, W]` maps.
+      scores: `[16, H, W]` in [0, 1].
+      count: number of grasps.
+      guided: share of grasps drawn in proportion to the squared odds of the score, traced.
+      hard: share drawn in proportion to the score's variance, score x (1 - score), traced.
+    """
+    kind_key, draw_key, random_key = jax.random.split(key, 3)
+    kind = jax.random.uniform(kind_key, (count,))
+    on = jnp.where(observation.label == ABSENT, -jnp.inf, 0.0)
+    yes, no = jnp.log(scores + 1e-6), jnp.log1p(1e-6 - scores)
+
+    def draw(k: jax.Array, u: jax.Array) -> jax.Array:
+        weight = jnp.where(u < guided, 2 * (yes - no), yes + no) + on
+        flat = jnp.argmax(weight + jax.random.gumbel(k, weight.shape))
+        return jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
+
+    index = jax.lax.map(lambda pair: draw(*pair), (jax.random.split(draw_key, count), kind))
+    chosen, anywhere = grasp_at(index, observation.height), random_grasps(random_key, observation, count=count)
+
+    def pick(one: jax.Array, other: jax.Array) -> jax.Array:
+        return jnp.where((kind < guided + hard).reshape(-1, *[1] * (one.ndim - 1)), one, other)
+
+    return jax.tree.map(pick, chosen, anywhere)
+
+
 def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The best of scores `[16, H, W]`: index `[3]` (rotation, row, col) and its score."""
     flat = jnp.argmax(scores)

@@ -8,6 +8,7 @@ reading walks back to the newest step that is whole.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import pathlib
@@ -140,6 +141,14 @@ def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
         )
     leaves = [stored[key] for key in wanted]
     return jax.tree.unflatten(jax.tree.structure(target), leaves)
+
+
+def digest(model: nnx.Module) -> str:
+    """SHA-256 of a network's parameters."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)):
+        found.update(np.asarray(leaf).tobytes())
+    return found.hexdigest()
 
 
 def config_from_json(name: str, values: dict[str, Any]) -> Any:

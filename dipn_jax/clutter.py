@@ -13,7 +13,7 @@ import numpy as np
 from dipn_jax import primitives, render, scenes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
-from dipn_jax.structs import Array, Fault, Observation, Scene, SettledScene
+from dipn_jax.structs import Array, Fault, Grasp, Observation, Scene, SettledScene
 
 BATCH, FEW = 64, 16
 """Scenes that compiled functions take at a time, of many and of few."""
@@ -63,6 +63,27 @@ def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, 
             )
         kept.append(structs.take(batch, slice(0, missing)))
     return structs.concatenate(kept)
+
+
+def grasp_away(
+    engine: Engine, scene: Scene, poses: Array, grasps: Grasp
+) -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
+    """Execute one grasp a scene, take away what is held, let the rest come to rest.
+
+    Args:
+      engine: physics.
+      scene: `[B, N]`.
+      poses: `[B, N, 7]`.
+      grasps: `[B]`.
+
+    Returns:
+      Scenes and poses `[B, N, 7]` afterwards, objects held `[B, N]` bool, and faults `[B]` of both simulations.
+    """
+    rollout, outcome = primitives.grasp(engine, scene, poses, grasps)
+    held = np.asarray(outcome.held)
+    scene, after = jax.device_get(scenes.remove(scene, np.asarray(rollout.poses)[:, -1], held))
+    rest = primitives.settle(engine, scene, after, duration=primitives.RESETTLE_TIME)
+    return scene, np.asarray(rest.poses)[:, -1], held, np.asarray(rollout.fault) | np.asarray(rest.fault)
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -9,12 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import candidates, console, files, planner, policy, primitives, render, scenes, structs
+from dipn_jax import candidates, clutter, console, files, planner, policy, primitives, render, resume, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
-from dipn_jax.structs import Decision, Fault, Observation, Push, Rollout, Scene
+from dipn_jax.structs import Decision, Fault, Observation, Push, Scene
 from dipn_jax.workspace import WORKSPACE
-from eval import metrics, resume
+from eval import metrics
 from eval.instances import Instance
 
 ACTIONS_PER_OBJECT = 3
@@ -114,7 +114,7 @@ def _push(rows: Acting, engine: Engine) -> None:
     scene, poses = _stack(rows)
     pushes: Push = jax.tree.map(lambda *leaves: np.stack(leaves), *[decision.push for _, _, decision in rows])
     rollout = primitives.push(engine, scene, poses, pushes)
-    wrong = _went_wrong(rollout)
+    wrong = (np.asarray(rollout.fault) & Fault.UNUSABLE) != 0
     for i, (instance, seen, decision) in enumerate(rows):
         instance.pushes += 1
         instance.ended = "fault" if wrong[i] else ""
@@ -126,11 +126,8 @@ def _grasp(rows: Acting, engine: Engine) -> None:
     scene, poses = _stack(rows)
     taken = [candidates.grasp_at(decision.grasp_pixel, seen.height) for _, seen, decision in rows]
     grasps = jax.tree.map(lambda *leaves: np.stack(leaves), *taken)
-    rollout, outcome = primitives.grasp(engine, scene, poses, grasps)
-    held, after = np.asarray(outcome.held), np.asarray(rollout.poses)[:, -1]
-    scene, after = jax.device_get(scenes.remove(scene, after, held))
-    rest = primitives.settle(engine, scene, after, duration=primitives.RESETTLE_TIME)
-    rested, wrong = np.asarray(rest.poses)[:, -1], _went_wrong(rollout) | _went_wrong(rest)
+    scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, grasps)
+    wrong = (fault & Fault.UNUSABLE) != 0
     for i, (instance, seen, decision) in enumerate(rows):
         instance.grasps += 1
         instance.held += bool(held[i].any())
@@ -138,11 +135,6 @@ def _grasp(rows: Acting, engine: Engine) -> None:
         instance.removed += int(held[i].sum())
         instance.scene, instance.poses = structs.take(scene, i), rested[i]
         _remember(instance, seen, decision, "grasp held" if held[i].any() else "grasp missed")
-
-
-def _went_wrong(rollout: Rollout) -> np.ndarray:
-    """Which simulations `[B]` cannot be believed."""
-    return (np.asarray(rollout.fault) & Fault.UNUSABLE) != 0
 
 
 def _remember(instance: Instance, seen: Observation, decision: Decision, what: str) -> None:

@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from dipn_jax import checkpoint, console, files, scenes
+from dipn_jax import checkpoint, console, files, resume, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import EngineName, make_engine
-from eval import clearing, grasping, metrics, prediction, resume
+from eval import clearing, grasping, metrics, prediction
 from eval import curve as curves
 from eval import instances as tables_to_clear
 from eval import report as reporting

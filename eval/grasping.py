@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import candidates, clutter, console, policy, primitives, render
+from dipn_jax import candidates, clutter, console, policy, primitives, render, resume
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Scorer
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.structs import Fault, Grasp, Scene
-from eval import metrics, resume
+from eval import metrics
 
 BINS = 10
 

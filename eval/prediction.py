@@ -21,6 +21,7 @@ from dipn_jax import (
     policy,
     primitives,
     render,
+    resume,
     segment,
     shapes,
     structs,
@@ -30,7 +31,6 @@ from dipn_jax.physics import Engine
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.structs import Fault, Observation, Push, Scene, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
-from eval import resume
 
 DISTANCES = (5, 10)
 """Centimetres at which errors are reported."""

@@ -18,7 +18,7 @@ STAGES = ("datagen", "train", "eval")
 ORDER = [
     "errors", "structs", "workspace", "geometry", "shapes", "scenes", "model", "physics", "primitives", "render",
     "segment", "candidates", "imagine", "losses", "networks", "planner", "files", "codec", "records", "checkpoint",
-    "clutter", "policy", "console",
+    "clutter", "policy", "resume", "console",
 ]  # fmt: skip
 
 

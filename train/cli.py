@@ -103,7 +103,7 @@ def grasp_pretrain(
 
 
 def grasp(
-    data: pathlib.Path,
+    data: tuple[pathlib.Path, ...],
     out: pathlib.Path,
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
@@ -112,8 +112,9 @@ def grasp(
     learning_rate: float = 1e-3,
     weight_decay: float = 1e-4,
     seed: int = 0,
-    eval_every: int = 100,
-    save_every: int = 100,
+    limit: int | None = None,
+    eval_every: int = 250,
+    save_every: int = 250,
 ) -> None:
     """GN on the outcomes of executed grasps, loss at the executed pixel only.
 
@@ -121,7 +122,7 @@ def grasp(
       dipn-train grasp --data data/grasp --init runs/gn-pretrained --out runs/gn
 
     Args:
-      data: folder of grasp episodes.
+      data: folders of grasp episodes.
       out: run folder; the same command goes on where it stopped.
       init: run to start from (grasp-pretrain's); its architecture is used.
       preset: architecture, without --init.
@@ -130,13 +131,16 @@ def grasp(
       learning_rate: at its highest.
       weight_decay: decay.
       seed: seed of weights, order and augmentation.
+      limit: learn from the first so many grasps of each folder only; what is held out stays the same.
       eval_every: steps between points of the learning curve.
       save_every: steps between checkpoints.
     """
     config = TrainConfig(steps, batch, learning_rate, weight_decay, "adamw", seed, eval_every, save_every)
+    if limit is not None:
+        console.require_positive(limit=limit)
     initial: Any = checkpoint.load_network(init, network="grasp") if init else None
     network_config = initial.config if initial else GraspConfig(preset=preset)
-    _fit(GraspTask(data, network_config), config, out, initial=initial)
+    _fit(GraspTask(data, network_config, limit=limit), config, out, initial=initial)
 
 
 def export(

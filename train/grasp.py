@@ -6,14 +6,16 @@ import functools
 import pathlib
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import geometry, losses, records, render, structs
+from dipn_jax import clutter, console, geometry, losses, records, render, scenes, structs
+from dipn_jax.errors import UserError
 from dipn_jax.networks import grasp
-from dipn_jax.structs import Grasp, GraspEpisode, Scene, SettledScene
+from dipn_jax.structs import ABSENT, Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from train.split import split
 
@@ -21,11 +23,13 @@ PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
 WINDOWS = {"compact": 112, "paper": 320}
 """Pixels around an executed grasp: the compact network sees about 50 on each side, the published one everything."""
+PHASE = 4
+"""Pixels by which a grasp is moved in its window at most: every phase of the network's strides is trained."""
 TABLE_WEIGHT = 0.05
 """Weight of a table pixel beside a foreground pixel: most of an image is table."""
 
 
-def turned_view(scene: Scene, poses: jax.Array, center: jax.Array, angle: jax.Array, *, pixels: int) -> Any:
+def turned_view(scene: Scene, poses: jax.Array, center: jax.Array, angle: jax.Array, *, pixels: int) -> Observation:
     """The observation of a view centred on `center [2]` (metres) with its columns along `angle []`."""
     shift = -geometry.rotate2d(center, -angle)
     return render.render(scene, geometry.transform_poses(poses, -angle, shift), pixels=pixels)
@@ -47,9 +51,9 @@ class PretrainTask:
     network = "grasp"
 
     def __init__(self, data: pathlib.Path, config: grasp.GraspConfig) -> None:
-        scenes, self.fingerprint = records.load(data, kind="images")
-        self.examples = len(scenes.fault)
-        self.train_set, self.test_set = split(scenes, data)
+        settled, self.fingerprint = records.load(data, kind="images")
+        self.examples = len(settled.fault)
+        self.train_set, self.test_set = split(settled, data)
         self.size = len(self.train_set.fault)
         self.network_config = config
 
@@ -57,10 +61,11 @@ class PretrainTask:
         """See `loop.Task`."""
         return structs.take(self.train_set, index)
 
-    def views(self, scenes: SettledScene, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def views(self, settled: SettledScene, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Images `[B, V, V, 4]`, labels `[B, V, V]` and weights `[B, V, V]` of random views."""
 
-        def one(scene: Scene, poses: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def one(args: tuple[Scene, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+            scene, poses, k = args
             angle_key, shift_key = jax.random.split(k)
             angle = jax.random.uniform(angle_key, maxval=2 * jnp.pi)
             center = jax.random.uniform(shift_key, (2,), minval=-0.08, maxval=0.08)
@@ -68,7 +73,7 @@ class PretrainTask:
             weight = jnp.where(seen.label >= 0, 1.0, TABLE_WEIGHT)
             return render.rgbd(seen), grasp.geometric_labels(seen.height), weight
 
-        return jax.vmap(one)(scenes.scene, scenes.poses, jax.random.split(key, scenes.fault.shape[0]))
+        return jax.lax.map(one, (settled.scene, settled.poses, jax.random.split(key, settled.fault.shape[0])))
 
     def loss(self, model: nnx.Module, batch: SettledScene, key: jax.Array) -> jax.Array:
         """See `loop.Task`."""
@@ -84,72 +89,152 @@ class PretrainTask:
         return {"held_out_loss": float(loss)}
 
     @functools.partial(jax.jit, static_argnums=(0, 1))
-    def _measure(self, graph: Any, state: Any, scenes: SettledScene) -> jax.Array:
-        images, labels, weight = self.views(scenes, jax.random.key(0))
+    def _measure(self, graph: Any, state: Any, settled: SettledScene) -> jax.Array:
+        images, labels, weight = self.views(settled, jax.random.key(0))
         return losses.score_loss(nnx.merge(graph, state)(images), labels, weight)
 
 
+@flax.struct.dataclass
+class Window(Pytree):
+    """What one executed grasp teaches; its closing axis lies along the columns."""
+
+    height: Array  # [W, W] float16 metres; the grasp is at the centre of pixel (W / 2, W / 2)
+    label: Array  # [W, W] int8: object slot, ABSENT on the table
+    color: Array  # [N, 3] in [0, 1], of the objects
+    success: Array  # [] bool
+
+
+@functools.partial(jax.jit, static_argnames="pixels")
+def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
+    """Windows `[B]` of episodes `[B]`."""
+
+    def one(episode: GraspEpisode) -> Window:
+        half = geometry.rotate2d(jnp.full(2, WORKSPACE.pixel / 2), episode.grasp.angle)
+        seen = turned_view(
+            episode.scene, episode.poses, episode.grasp.center - half, episode.grasp.angle, pixels=pixels
+        )
+        height, label = seen.height.astype(jnp.float16), seen.label.astype(jnp.int8)
+        return Window(height, label, episode.scene.color, episode.success)
+
+    return jax.lax.map(one, episodes)
+
+
+def executed_loss(model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
+    """Cross entropy of executed grasps `[B]`, each moved by some pixels in its window and mirrored or not."""
+    phase_key, flip_key = jax.random.split(key)
+    images, pixel = view(batch, jax.random.randint(phase_key, (len(batch.success), 2), 0, 2 * PHASE))
+    mask = jnp.zeros(images.shape[:3]).at[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]].set(1.0)
+    images, mask = _flips(flip_key, images, mask)
+    logits = (model(images) * mask).sum((1, 2))
+    return losses.score_loss(logits, batch.success.astype(jnp.float32), jnp.ones(len(images)))
+
+
+def view(batch: Window, begin: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Images `[B, W - 2 PHASE, W - 2 PHASE, 4]` whose first pixel is `begin [B, 2]`; executed pixels `[B, 2]`."""
+    wide = batch.height.shape[-1]
+    side = wide - 2 * PHASE
+
+    def one(window: Window, corner: jax.Array) -> jax.Array:
+        cut = functools.partial(jax.lax.dynamic_slice, start_indices=corner, slice_sizes=(side, side))
+        label = cut(window.label).astype(jnp.int32)
+        height = cut(window.height).astype(jnp.float32)
+        return render.rgbd(Observation(height, render.paint_labels(label, window.color), label))
+
+    return jax.vmap(one)(batch, begin), wide // 2 - begin
+
+
 class GraspTask:
-    """Outcomes of executed grasps: loss at the executed pixel only, so only a window around it is rendered."""
+    """Outcomes of executed grasps: loss at the executed pixel only, so only a window around it is rendered.
+
+    Windows of the `compact` network are rendered once and kept, 40 KB a grasp.
+    """
 
     network = "grasp"
 
-    def __init__(self, data: pathlib.Path, config: grasp.GraspConfig) -> None:
-        episodes, self.fingerprint = records.load(data, kind="grasp")
-        self.examples = len(episodes.fault)
-        self.train_set, self.test_set = split(episodes, data)
-        self.window = WINDOWS[config.preset]
-        self.size = len(self.train_set.fault)
-        self.network_config = config
+    def __init__(self, data: tuple[pathlib.Path, ...], config: grasp.GraspConfig, *, limit: int | None = None) -> None:
+        """Load data sets.
 
-    def fetch(self, index: np.ndarray) -> GraspEpisode:
-        """See `loop.Task`."""
-        return structs.take(self.train_set, index)
+        Args:
+          data: folders of grasp episodes; of each, the last tenth is held out.
+          config: architecture.
+          limit: learn from the first so many grasps of each only; what is held out stays the same.
 
-    def windows(self, episodes: GraspEpisode, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Images `[B, W, W, 4]` and the executed pixel `[B, 2]` (row, col), near the middle.
-
-        The pixel is shifted by 0 to 7 pixels, so that every phase of the network's strides is trained.
+        Raises:
+          UserError: no folder; or one is damaged, or holds something else.
         """
-        count = episodes.fault.shape[0]
-        phase = jax.random.randint(key, (count, 2), -4, 4)
+        if not data:
+            raise UserError("--data: want at least one folder of dipn-datagen grasp")
+        loaded = [records.load(folder, kind="grasp") for folder in data]
+        slots = max(episodes.scene.shape.shape[1] for episodes, _ in loaded)
+        sides = [split(_widened(episodes, slots), folder) for (episodes, _), folder in zip(loaded, data, strict=True)]
+        self.train_set = structs.concatenate([structs.take(learnt, slice(0, limit)) for learnt, _ in sides])
+        self.test_set = structs.concatenate([held_out for _, held_out in sides])
+        self.fingerprint = ":".join([*(fingerprint for _, fingerprint in loaded), *([str(limit)] if limit else [])])
+        self.size = self.examples = len(self.train_set.fault)
+        self.network_config = config
+        self.window = WINDOWS[config.preset] + 2 * PHASE
+        self._kept: dict[str, Window] = {}
 
-        def one(scene: Scene, poses: jax.Array, taken: Grasp, shift: jax.Array) -> jax.Array:
-            offset = (shift[::-1] + 0.5) * WORKSPACE.pixel  # (row, col) -> (x, y)
-            center = taken.center - geometry.rotate2d(offset, taken.angle)
-            return render.rgbd(turned_view(scene, poses, center, taken.angle, pixels=self.window))
+    def prepare(self, episodes: GraspEpisode) -> Window:
+        """Windows `[B]` of episodes `[B]`, numpy."""
+        return jax.device_get(clutter.in_chunks(functools.partial(_windows, pixels=self.window), episodes))
 
-        images = jax.vmap(one)(episodes.scene, episodes.poses, episodes.grasp, phase)
-        return images, self.window // 2 + phase
-
-    def _logits(self, model: nnx.Module, images: jax.Array, pixel: jax.Array) -> jax.Array:
-        logits = model(images)
-        return logits[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
-
-    def loss(self, model: nnx.Module, batch: GraspEpisode, key: jax.Array) -> jax.Array:
+    def fetch(self, index: np.ndarray) -> Window:
         """See `loop.Task`."""
-        phase_key, flip_key = jax.random.split(key)
-        images, pixel = self.windows(batch, phase_key)
-        mask = jnp.zeros(images.shape[:3]).at[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]].set(1.0)
-        images, mask = _flips(flip_key, images, mask)
-        logits = (model(images) * mask).sum((1, 2))
-        return losses.score_loss(logits, batch.success.astype(jnp.float32), jnp.ones(len(images)))
+        return self._take("train", self.train_set, index)
+
+    def _take(self, name: str, episodes: GraspEpisode, index: np.ndarray) -> Window:
+        if self.network_config.preset == "paper":
+            return self.prepare(structs.take(episodes, index))
+        if name not in self._kept:
+            self._kept[name] = self._prepare_all(episodes)
+        return structs.take(self._kept[name], index)
+
+    def _prepare_all(self, episodes: GraspEpisode) -> Window:
+        made, count, some = [], len(episodes.fault), 8 * clutter.BATCH
+        with console.Progress("render windows", count, unit="grasps") as progress:
+            for begin in range(0, count, some):
+                made.append(self.prepare(structs.take(episodes, slice(begin, begin + some))))
+                progress.advance(len(made[-1].success), "")
+        return structs.concatenate(made)
+
+    def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
+        """See `loop.Task`."""
+        return executed_loss(model, batch, key)
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss and accuracy on held-out grasps."""
         graph, state = nnx.split(model)
-        size, rows = 64, []
-        for begin in range(0, len(self.test_set.fault), size):
-            index = np.arange(begin, begin + size) % len(self.test_set.fault)
-            weight = np.arange(begin, begin + size) < len(self.test_set.fault)
-            rows.append([float(v) for v in self._measure(graph, state, structs.take(self.test_set, index), weight)])
-        loss, correct, count = np.array(rows).sum(0)
-        return {"held_out_loss": loss / count, "accuracy": correct / count}
+        size, rows, count = clutter.BATCH, [], len(self.test_set.fault)
+        for begin in range(0, count, size):
+            index = np.arange(begin, begin + size)
+            weight = (index < count).astype(np.float32)
+            some = self._take("test", self.test_set, index % count)
+            rows.append([float(v) for v in _measure(graph, state, some, weight)])
+        loss, correct = np.array(rows).sum(0) / count
+        return {"held_out_loss": loss, "accuracy": correct}
 
-    @functools.partial(jax.jit, static_argnums=(0, 1))
-    def _measure(self, graph: Any, state: Any, episodes: GraspEpisode, weight: jax.Array) -> tuple[jax.Array, ...]:
-        images, pixel = self.windows(episodes, jax.random.key(0))
-        logits = self._logits(nnx.merge(graph, state), images, pixel)
-        success = episodes.success
-        loss = losses.score_loss(logits, success.astype(jnp.float32), weight.astype(jnp.float32)) * weight.sum()
-        return loss, ((logits > 0) == success) @ weight.astype(jnp.float32), weight.sum()
+
+@functools.partial(jax.jit, static_argnums=0)
+def _measure(graph: Any, state: Any, batch: Window, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Weighted sums over grasps `[B]` of the loss and of how many are told right."""
+    images, pixel = view(batch, jnp.full((len(batch.success), 2), PHASE))
+    logits = nnx.merge(graph, state)(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
+    loss = losses.score_loss(logits, batch.success.astype(jnp.float32), weight) * weight.sum()
+    return loss, ((logits > 0) == batch.success) @ weight
+
+
+def _widened(episodes: GraspEpisode, slots: int) -> GraspEpisode:
+    """Episodes `[B, N]` as `[B, slots]`, so that data sets of different numbers of objects can be joined."""
+    more = slots - episodes.scene.shape.shape[1]
+    if not more:
+        return episodes
+
+    def pad(leaf: Array, value: float = 0) -> np.ndarray:
+        edges = [(0, 0), (0, more)] + [(0, 0)] * (leaf.ndim - 2)
+        return np.pad(leaf, edges, constant_values=value)
+
+    scene = jax.tree.map(pad, episodes.scene).replace(shape=pad(episodes.scene.shape, ABSENT))
+    away = np.broadcast_to(scenes.parked(more), (len(episodes.fault), more, 7))
+    poses, after = (np.concatenate([part, away], 1) for part in (episodes.poses, episodes.after))
+    return episodes.replace(scene=scene, poses=poses, after=after, held=pad(episodes.held))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import json
 import logging
 import pathlib
@@ -182,12 +181,7 @@ def _resume(out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTrans
 
 def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> dict[str, Any]:
     """What a run is a function of; flat, so that a difference can be named."""
-    start = None
-    if initial is not None:
-        digest = hashlib.sha256()
-        for leaf in jax.tree.leaves(nnx.state(initial, nnx.Param)):
-            digest.update(np.asarray(leaf).tobytes())
-        start = digest.hexdigest()
+    start = None if initial is None else checkpoint.digest(initial)
     network = {f"network.{k}": v for k, v in dataclasses.asdict(task.network_config).items()}
     data = {"network": task.network, "initial_weights": start, "data": task.fingerprint}
     return {**data, **network, **dataclasses.asdict(config)}

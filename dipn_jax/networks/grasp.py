@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from dipn_jax import geometry, render
 from dipn_jax.errors import UserError
 from dipn_jax.networks import resnet
-from dipn_jax.workspace import ROTATIONS, WORKSPACE, grasp_angles
+from dipn_jax.workspace import GRIPPER, ROTATIONS, WORKSPACE, grasp_angles
 
 VIEW = 320
 """Pixels of the padded, rotated input: the turned 224 pixel map fits."""
@@ -19,6 +23,12 @@ VIEW = 320
 
 MIN_DEPTH = 0.002
 """Metres of object that must be between the fingers; objects 25 mm high lie 5 mm over the lowest fingertip."""
+SCALE = (0.5, 0.5, 0.5, 0.05)
+"""What red, green, blue (in [0, 1]) and height (metres) are divided by."""
+BLOCK = 4
+"""Pixels a side of a cell: the compact network works on cells."""
+FINGER_COLUMNS = (round(GRIPPER.stroke / 2 / WORKSPACE.pixel), round(GRIPPER.stroke / 2 / WORKSPACE.pixel) + 10)
+"""Pixels from the middle of a grasp to where a finger begins and ends."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +38,8 @@ class GraspConfig:
     preset: str = "compact"
     stages: tuple[int, ...] = (3, 4, 6, 3)  # paper: ResNet-50
     width: int = 24  # compact: channels at stride 4
+    coarse: int = 48  # compact: channels at stride 8
+    blocks: int = 2  # compact: residual blocks at stride 8
 
     def __post_init__(self) -> None:
         if self.preset not in ("paper", "compact"):
@@ -69,21 +81,25 @@ class _CompactTrunk(nnx.Module):
     """Strides 4 and 8, read out by sub-pixel convolution; sees about 50 pixels around a grasp."""
 
     def __init__(self, config: GraspConfig, rngs: nnx.Rngs) -> None:
-        w = config.width
-        self.stem = resnet.conv(4 * 16, w, 3, rngs)
-        self.block1 = resnet.PlainBlock(w, rngs)
-        self.down = resnet.conv(w, 2 * w, 3, rngs, stride=2)
-        self.block2 = resnet.PlainBlock(2 * w, rngs)
-        self.block3 = resnet.PlainBlock(2 * w, rngs)
-        self.up = resnet.conv(2 * w, w, 1, rngs)
-        self.head = resnet.conv(w, 2 * w, 3, rngs)
-        self.out = resnet.conv(2 * w, 16, 1, rngs)
+        fine, coarse = config.width, config.coarse
+        self.stem = resnet.conv(4 * BLOCK**2, fine, 3, rngs)
+        self.down = resnet.conv(fine, coarse, 3, rngs, stride=2)
+        self.blocks = nnx.List([resnet.PlainBlock(coarse, rngs) for _ in range(config.blocks)])
+        self.up = resnet.conv(coarse, 4 * fine, 1, rngs)
+        self.head = resnet.conv(fine, 2 * fine, 3, rngs)
+        self.out = resnet.conv(2 * fine, BLOCK**2, 1, rngs)
+
+    def cells(self, x: jax.Array) -> jax.Array:
+        """Logits `[B, h, w, 16]` of the pixels of cells `[B, h, w, 64]`; h and w even."""
+        fine = nnx.relu(self.stem(x))
+        coarse = nnx.relu(self.down(fine))
+        for block in self.blocks:
+            coarse = block(coarse)
+        both = nnx.relu(fine + resnet.depth_to_space(self.up(coarse), 2))
+        return self.out(nnx.relu(self.head(both)))
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        fine = self.block1(nnx.relu(self.stem(resnet.space_to_depth(x, 4))))
-        coarse = self.block3(self.block2(nnx.relu(self.down(fine))))
-        both = nnx.relu(fine + resnet.upsample2(self.up(coarse)))
-        return resnet.depth_to_space(self.out(nnx.relu(self.head(both))), 4)[..., 0]
+        return resnet.depth_to_space(self.cells(resnet.space_to_depth(x, BLOCK)), BLOCK)[..., 0]
 
 
 class GraspNet(nnx.Module):
@@ -99,8 +115,12 @@ class GraspNet(nnx.Module):
         Args:
           images: `[B, H, W, 4]` RGB in [0, 1] and height in metres; sides divisible by 8 (`paper`: 32).
         """
-        table = jnp.array([*render.TABLE_COLOR, 0.0])
-        return self.body((images - table) / jnp.array([0.5, 0.5, 0.5, 0.05]))
+        return self.body(_normalized(images))
+
+
+def _normalized(images: jax.Array) -> jax.Array:
+    """Images as the network sees them: the table is 0."""
+    return (images - jnp.array([*render.TABLE_COLOR, 0.0])) / jnp.array(SCALE)
 
 
 def score_image(network: GraspNet, image: jax.Array) -> jax.Array:
@@ -113,25 +133,55 @@ def score_image(network: GraspNet, image: jax.Array) -> jax.Array:
     Returns:
       Scores `[16, 224, 224]` in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
     """
-    table = jnp.array([*render.TABLE_COLOR, 0.0])
-    # The gripper is its own mirror image: a grasp turned by half a turn is the same grasp, so the compact
-    # form scores half of the rotations and repeats them.
-    angles = jnp.asarray(grasp_angles())
     if network.config.preset == "compact":
-        angles = angles[: ROTATIONS // 2]
+        body: Any = network.body
+        return _score_cells(body.cells, image)
+    angles = jnp.asarray(grasp_angles())
+    table = jnp.array([*render.TABLE_COLOR, 0.0])
     views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, VIEW) + table)(angles)
     scores = nnx.sigmoid(network(views))
-    scores = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
-    return jnp.tile(scores, (ROTATIONS // len(angles), 1, 1))
+    return jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
+
+
+def _score_cells(cells: Callable[[jax.Array], jax.Array], image: jax.Array) -> jax.Array:
+    """As `score_image`: turned, cut into cells and turned back by tables that are made once.
+
+    The gripper is its own mirror image: a grasp turned by half a turn is the same grasp, so half of the rotations are
+    scored and repeated.
+    """
+    there, back = _turning_tables()
+    flat = jnp.concatenate([_normalized(image).reshape(-1, 4), jnp.zeros((1, 4))])
+    views = flat[there].reshape(*there.shape[:3], -1)
+    scores = nnx.sigmoid(cells(views).reshape(-1))[back]
+    return jnp.tile(scores, (2, 1, 1))
+
+
+@functools.cache
+def _turning_tables() -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel comes from when half of the rotations are applied, and undone.
+
+    Returns:
+      Of each pixel of each cell of the turned views, the pixel of the image `[8, 80, 80, 16]` (the one past the end is
+      table), and of each pixel of each score map the place in the logits of all cells `[8, 224, 224]`.
+    """
+    side, count, cells = WORKSPACE.pixels, ROTATIONS // 2, VIEW // BLOCK
+    with jax.ensure_compile_time_eval():
+        angles = jnp.asarray(grasp_angles()[:count])
+        image = jnp.arange(side**2).reshape(side, side)
+        turned = jax.vmap(lambda a: geometry.rotate_map(image, a, VIEW, side**2))(angles)
+        views = jnp.arange(count * VIEW**2).reshape(count, cells, cells, BLOCK, BLOCK)
+        views = views.transpose(0, 1, 3, 2, 4).reshape(count, VIEW, VIEW)
+        back = jax.vmap(lambda v, a: geometry.unrotate_map(v, a, side))(views, angles)
+        there = resnet.space_to_depth(turned[..., None], BLOCK)
+    return np.asarray(there), np.asarray(back)
 
 
 def geometric_labels(height: jax.Array) -> jax.Array:
     """Which grasps are free of physics' objections, from the height map of a turned view alone.
 
     A grasp centred on a pixel and closing along its row is positive when there is object between the
-    fingers at the depth they would reach, and none where they come down. Finger zones: rows +-4 and
-    columns 19 to 28 on each side (source: DIPN's released code; 2 mm a pixel, so 38 to 56 mm for
-    fingers from 37 to 57 mm).
+    fingers at the depth they would reach, and none where they come down: a pad's width of rows, and
+    `FINGER_COLUMNS` on each side (DIPN's released code has rows +-4, columns 19 to 28 of its own gripper).
 
     Args:
       height: `[H, W]` metres.
@@ -149,5 +199,7 @@ def geometric_labels(height: jax.Array) -> jax.Array:
         begin = low if low > 0 else 0
         return top[:, begin : begin + height.shape[1]]
 
-    fingers = jnp.maximum(highest(-28, -19, 4), highest(19, 28, 4))
+    near, far = FINGER_COLUMNS
+    rows = round(GRIPPER.pad_width / 2 / WORKSPACE.pixel)
+    fingers = jnp.maximum(highest(-far, -near, rows), highest(near, far, rows))
     return ((height > tip + MIN_DEPTH) & (fingers < tip)).astype(jnp.float32)

@@ -14,9 +14,9 @@ from dipn_jax import checkpoint, clutter, policy, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.resume import Partial
 from dipn_jax.structs import Push
 from eval import clearing, grasping, instances, metrics, prediction, report
-from eval.resume import Partial
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 

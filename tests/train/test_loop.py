@@ -13,7 +13,7 @@ from dipn_jax import candidates, checkpoint, geometry, render, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from train.grasp import GraspTask, PretrainTask
+from train.grasp import PHASE, GraspTask, PretrainTask, view
 from train.loop import TrainConfig, fit, make_optimizer, make_step
 from train.push import PushTask
 
@@ -90,7 +90,7 @@ def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tm
     )
     assert first["held_out_loss"] < 0.5
     initial = checkpoint.load_network(tmp_path / "a", network="grasp")
-    task = GraspTask(data["grasp"], config)
+    task = GraspTask((data["grasp"],), config)
     plan = TrainConfig(steps=250, batch=16, learning_rate=5e-3, eval_every=250, save_every=250)
     fit(task, plan, tmp_path / "b", initial=initial)
     rate = task.train_set.success.mean()
@@ -100,9 +100,10 @@ def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tm
 
 
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
-    task = GraspTask(data["grasp"], GraspConfig(width=8))
-    episodes = task.fetch(np.arange(6))
-    images, pixel = task.windows(episodes, jax.random.key(0))
+    task = GraspTask((data["grasp"],), GraspConfig(width=8))
+    episodes = structs.take(task.train_set, np.arange(6))
+    begin = jax.random.randint(jax.random.key(0), (6, 2), 0, 2 * PHASE)
+    images, pixel = view(task.fetch(np.arange(6)), begin)
     height = np.asarray(images)[np.arange(6), pixel[:, 0], pixel[:, 1], 3]
     # tip = max(height - 0.04, 0.02) was computed from the unturned map: equal up to a pixel of sampling
     assert np.median(np.abs(np.maximum(height - 0.04, 0.02) - episodes.grasp.height)) < 1e-3
@@ -115,7 +116,7 @@ def test_the_published_networks_take_their_tasks(data: dict[str, pathlib.Path]) 
     tasks = (
         PushTask(data["push"], dipn, limit=None, centimetres=(5, 10)),
         PretrainTask(data["images"], gn),
-        GraspTask(data["grasp"], gn),
+        GraspTask((data["grasp"],), gn),
     )
     optimizer = make_optimizer(BRIEF)
     for task in tasks:
@@ -137,7 +138,7 @@ def test_a_hard_stop_inside_a_line_of_metrics_is_survived(task: PushTask, tmp_pa
 
 
 def test_no_scene_is_on_both_sides_of_the_split(data: dict[str, pathlib.Path]) -> None:
-    task = GraspTask(data["grasp"], GraspConfig())
+    task = GraspTask((data["grasp"],), GraspConfig())
     scenes = [{size.tobytes() for size in part.scene.size} for part in (task.train_set, task.test_set)]
     assert not scenes[0] & scenes[1] and scenes[1]
 
@@ -181,7 +182,7 @@ def test_nonsense_is_refused(data: dict[str, pathlib.Path], tmp_path: pathlib.Pa
     with pytest.raises(UserError, match="leaves none of the pushes"):
         PushTask(data["push"], SMALL, limit=None, centimetres=(5,), without=shapes.CLASSES)
     with pytest.raises(UserError, match="holds push episodes, want grasp"):
-        GraspTask(data["push"], GraspConfig())
+        GraspTask((data["push"],), GraspConfig())
     task = PushTask(data["push"], SMALL, limit=None, centimetres=(5,))
     with pytest.raises(UserError, match="--optimizer"):
         fit(task, TrainConfig(steps=2, optimizer="adagrad"), tmp_path / "x")

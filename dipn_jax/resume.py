@@ -1,4 +1,4 @@
-"""An interrupted evaluation goes on where it stopped: its state is kept beside its results until it ends."""
+"""Work that was interrupted goes on where it stopped: its state is kept beside its results until it ends."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from dipn_jax import checkpoint, files
 
 
 class Partial:
-    """The state of an evaluation under way, in `OUT/partial.pickle`; that of other settings is not taken up."""
+    """The state of work under way, in `OUT/partial.pickle`; that of other settings is not taken up."""
 
     def __init__(self, out: pathlib.Path, settings: dict[str, Any], *, inputs: Sequence[pathlib.Path] = ()) -> None:
         """Look for a state.
 
         Args:
-          out: folder of the evaluation.
+          out: folder of the results.
           settings: options that the results depend on.
           inputs: files and runs that they depend on; their content counts, not their name.
         """
