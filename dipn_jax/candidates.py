@@ -123,6 +123,13 @@ def grasp_at(index: Array, height: jax.Array) -> Grasp:
     return Grasp(center, rotation * jnp.float32(2 * jnp.pi / ROTATIONS), grasp_height(height[row, col]))
 
 
+def grasp_index(grasp: Grasp) -> jax.Array:
+    """Inverse of `grasp_at`: `[..., 3]` int32 (rotation, row, col)."""
+    pixel = jnp.round(geometry.metres_to_pixels(grasp.center))
+    rotation = jnp.round(grasp.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
+    return jnp.stack([rotation, pixel[..., 1], pixel[..., 0]], -1).astype(jnp.int32)
+
+
 @functools.partial(jax.jit, static_argnames="count")
 def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Grasp:
     """`count` grasps at uniformly random foreground pixels, each at one of the 16 angles."""
@@ -171,3 +178,15 @@ def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
     flat = jnp.argmax(scores)
     index = jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
     return index, scores.reshape(-1)[flat]
+
+
+def best_grasps(scores: jax.Array, *, count: int, apart: float = 8.0) -> jax.Array:
+    """The best of scores `[16, H, W]`, then the best that is `apart` pixels from it, and so on: `[count, 3]`."""
+    grid = geometry.view_grid(*scores.shape[1:])
+
+    def next_best(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        index = best_grasp(left)[0]
+        near = jnp.linalg.norm(grid - index[::-1][:2], axis=-1) < apart
+        return jnp.where(near, -1.0, left), index
+
+    return jax.lax.scan(next_best, scores, None, length=count)[1]

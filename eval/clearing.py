@@ -14,7 +14,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Decision, Fault, Observation, Push, Scene
 from dipn_jax.workspace import WORKSPACE
-from eval import metrics
+from eval import film, metrics
 from eval.instances import Instance
 
 ACTIONS_PER_OBJECT = 3
@@ -63,6 +63,7 @@ def clear(
     with console.Progress("clear", total, unit="objects", done=sum(i.removed for i in instances)) as progress:
         while active := [instance for instance in instances if not instance.ended]:
             before = sum(instance.removed for instance in instances)
+            was = [(instance.scene.shape, instance.poses) for instance in active]
             step = jax.random.fold_in(jax.random.key(seed), turn)
             decisions = [
                 _decide(jax.random.fold_in(step, i), instance, predictor, scorer, config)
@@ -74,7 +75,8 @@ def clear(
                 _push(pushing, engine)
             if grasping:
                 _grasp(grasping, engine)
-            for instance in active:
+            for instance, state, (_, decision) in zip(active, was, decisions, strict=True):
+                _remember(instance, state, decision)
                 instance.ended = instance.ended or _ended(instance)
             turn += 1
             partial.save((turn, instances))
@@ -115,11 +117,11 @@ def _push(rows: Acting, engine: Engine) -> None:
     pushes: Push = jax.tree.map(lambda *leaves: np.stack(leaves), *[decision.push for _, _, decision in rows])
     rollout = primitives.push(engine, scene, poses, pushes)
     wrong = (np.asarray(rollout.fault) & Fault.UNUSABLE) != 0
-    for i, (instance, seen, decision) in enumerate(rows):
+    for i, (instance, _, _) in enumerate(rows):
         instance.pushes += 1
         instance.ended = "fault" if wrong[i] else ""
         instance.poses = np.asarray(rollout.poses)[i, -1]
-        _remember(instance, seen, decision, "push")
+        instance.did.append("push")
 
 
 def _grasp(rows: Acting, engine: Engine) -> None:
@@ -128,33 +130,28 @@ def _grasp(rows: Acting, engine: Engine) -> None:
     grasps = jax.tree.map(lambda *leaves: np.stack(leaves), *taken)
     scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, grasps)
     wrong = (fault & Fault.UNUSABLE) != 0
-    for i, (instance, seen, decision) in enumerate(rows):
+    for i, (instance, _, _) in enumerate(rows):
         instance.grasps += 1
         instance.held += bool(held[i].any())
         instance.ended = "fault" if wrong[i] else ""
         instance.removed += int(held[i].sum())
         instance.scene, instance.poses = structs.take(scene, i), rested[i]
-        _remember(instance, seen, decision, "grasp held" if held[i].any() else "grasp missed")
+        instance.did.append("grasp held" if held[i].any() else "grasp missed")
 
 
-def _remember(instance: Instance, seen: Observation, decision: Decision, what: str) -> None:
-    after = render.render(instance.scene, instance.poses)
+def _remember(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: Decision) -> None:
+    """Keep what a frame can be drawn from again: where everything was, and what was decided."""
     push = decision.push
     instance.film.append(
         {
-            "what": what,
-            "before": _bytes(seen.color),
-            "predicted": _bytes(decision.predicted[..., :3]),
-            "after": _bytes(after.color),
+            "shape": state[0],
+            "poses": state[1],
             "push": np.array([*push.start, push.angle, push.distance], np.float32),
             "grasp": np.asarray(decision.grasp_pixel),
             "values": np.array([decision.grasp_score, decision.value_now, decision.value_push], np.float32),
+            "motion": np.asarray(decision.motion, np.float32),
         }
     )
-
-
-def _bytes(color: Any) -> np.ndarray:
-    return np.round(np.clip(np.asarray(color), 0, 1) * 255).astype(np.uint8)
 
 
 def _ended(instance: Instance) -> str:
@@ -197,15 +194,11 @@ def summary(instances: list[Instance]) -> dict[str, Any]:
 
 
 def save(instances: list[Instance], out: pathlib.Path) -> None:
-    """Every step of every instance, as `episodes/NAME.npz` and a line of `episodes.jsonl`."""
+    """Every step of every instance, as `episodes/NUMBER.npz` (see `eval.film`), and a list of them, `episodes.json`."""
     lines = []
     for number, instance in enumerate(instances):
         stem = f"{number:03d}"
-        (out / "episodes").mkdir(parents=True, exist_ok=True)
-        arrays: dict[str, Any] = {
-            key: np.stack([step[key] for step in instance.film]) for key in instance.film[0] if key != "what"
-        }
-        np.savez_compressed(out / "episodes" / f"{stem}.npz", what=[s["what"] for s in instance.film], **arrays)
+        film.save(out / "episodes" / f"{stem}.npz", instance)
         lines.append(
             {
                 "name": instance.name,

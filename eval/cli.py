@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from dipn_jax import checkpoint, console, files, resume, scenes
+from dipn_jax import checkpoint, console, files, policy, resume, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import EngineName, make_engine
 from eval import clearing, grasping, metrics, prediction
@@ -117,25 +117,36 @@ def grasp(
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 100,
     objects: Objects = "10",
     seed: int = 1_000_000,
+    others: int = 0,
     engine: EngineName = "auto",
+    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
 ) -> None:
-    """Success of the best-scored grasp, beside that of a random foreground pixel at a random angle.
+    """Success of the best-scored grasp, over every attempt until the tables are empty; a random grasp beside it.
 
-      dipn-eval grasp --grasp-net runs/gn --out results/grasp
+      dipn-eval grasp --grasp-net builtin --out results/grasp
 
     Args:
-      grasp_net: run of dipn-train grasp.
-      out: folder for metrics.json.
-      scenes_: how many scenes, one grasp of each kind on each.
-      objects: number of objects in a scene.
+      grasp_net: run of dipn-train grasp, or builtin.
+      out: folder for metrics.json, reliability.png and every step of every table.
+      scenes_: how many tables.
+      objects: number of objects on a table.
       seed: of scenes and random grasps; keep it away from the training data's.
+      others: where a grasp missed, try so many of the next best ones from the same state: what physics allows.
       engine: physics.
+      ranges: what random objects are drawn from.
     """
     settings = dict(locals())
     _check(out, seed, scenes=scenes_)
-    config = scenes.parse_objects(objects)
-    partial = resume.Partial(out, settings, inputs=[grasp_net])
-    values = grasping.evaluate(grasp_net, make_engine(engine), config, partial, scenes=scenes_, seed=seed)
+    console.require_between(0, 1024, others=others)
+    config = scenes.parse_objects(objects, ranges=ranges)
+    run = checkpoint.find(grasp_net, network="grasp")
+    partial = resume.Partial(out, settings, inputs=[run])
+    scorer = policy.load_scorer(run)
+    values, tables = grasping.evaluate(
+        scorer, make_engine(engine), config, partial, scenes=scenes_, seed=seed, others=others
+    )
+    clearing.save(tables, out)
+    grasping.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
     _finish(out, values, settings, partial)
 
 
@@ -196,7 +207,7 @@ def clear(
         tables = tables_to_clear.hard_instances(
             physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed
         )
-    inputs = [grasp_net, *([] if cases == "random" else [path])]
+    inputs = [checkpoint.find(grasp_net, network="grasp"), *([] if cases == "random" else [path])]
     if push_net:
         inputs.append(checkpoint.find(push_net, network="dipn"))
     partial = resume.Partial(out, settings, inputs=inputs)

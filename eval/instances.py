@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Any
 
 import jax
 import numpy as np
@@ -28,7 +27,8 @@ class Instance:
     removed: int = 0
     held: int = 0  # grasps that held something
     ended: str = ""  # cleared, pushed out, out of actions, fault
-    film: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action
+    film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # what preceded each action
 
     @property
     def actions(self) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.workspace import WORKSPACE
-from eval import metrics
+from eval import film, metrics
 
 FILM_ROWS = 4
 _STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
@@ -145,8 +145,9 @@ def _prediction_section(values: dict[str, Any]) -> str:
 def _grasp_section(values: dict[str, Any]) -> str:
     rows = [[name, _percent(values, f"grasp_success/{name}")] for name in ("gn", "random_foreground")]
     return (
-        f"<h2>Grasping</h2><p>{values['attempts']} scenes, one grasp of each kind; expected calibration error "
-        f"{values['expected_calibration_error']:.3f}.</p>{_table(['', 'success %'], rows)}"
+        f"<h2>Grasping</h2><p>{values['attempts']} grasps by GN until {values['scenes']} tables were empty, and "
+        f"a random one on each; expected calibration error {values['expected_calibration_error']:.3f}.</p>"
+        f"{_table(['', 'success %'], rows)}"
     )
 
 
@@ -204,23 +205,26 @@ def _filmstrip(folder: pathlib.Path) -> Any:
     """Some steps of the tables of a `dipn-eval clear`: pushes first."""
     steps = []
     for entry in files.read_json(folder / "episodes.json", wanted=list):
-        film = _load(folder / entry["file"])
-        steps += [(entry, i, {key: film[key][i] for key in film.files}) for i in range(len(film["what"]))]
-    steps.sort(key=lambda s: (str(s[2]["what"]) != "push", s[1]))
+        reel = film.load(folder / entry["file"])
+        steps += [(entry["name"], i, reel) for i in range(len(reel.what))]
+    steps.sort(key=lambda step: (str(step[2].what[step[1]]) != "push", step[1]))
     chosen = steps[:FILM_ROWS]
     figure, axes = plt.subplots(len(chosen), 3, figsize=(7.5, 2.7 * len(chosen)), squeeze=False)
-    for row, (entry, i, step) in enumerate(chosen):
-        pushed = str(step["what"]) == "push"
-        score, now, push = step["values"]
-        _show(axes[row, 0], step["before"], f"{entry['name']}, action {i + 1}: {step['what']}")
-        _arrow(axes[row, 0], step["push"]) if pushed else _jaws(axes[row, 0], step["grasp"])
-        if pushed:
-            _show(axes[row, 1], step["predicted"], f"predicted: {push:.4f} > {now:.4f}")
-        elif np.isfinite(push):
-            _show(axes[row, 1], step["predicted"], f"best push, not taken: {push:.4f} < {now:.4f}")
+    for row, (name, i, reel) in enumerate(chosen):
+        before, predicted, after = reel.pictures(i)
+        score, now, push = reel.values[i]
+        _show(axes[row, 0], before, f"{name}, action {i + 1}: {reel.what[i]}")
+        if reel.what[i] == "push":
+            _arrow(axes[row, 0], reel.push[i])
+            title = f"predicted: {push:.4f} > {now:.4f}"
         else:
-            _show(axes[row, 1], step["predicted"], f"no push considered: grasp score {score:.2f}")
-        _show(axes[row, 2], step["after"], "what happened")
+            _jaws(axes[row, 0], reel.grasp[i])
+            considered = np.isfinite(push)
+            title = (
+                f"best push, not taken: {push:.4f} < {now:.4f}" if considered else f"no push; grasp score {score:.2f}"
+            )
+        _show(axes[row, 1], predicted, title)
+        _show(axes[row, 2], after, "what happened")
     return figure
 
 

@@ -16,7 +16,7 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.resume import Partial
 from dipn_jax.structs import Push
-from eval import clearing, grasping, instances, metrics, prediction, report
+from eval import clearing, film, grasping, instances, metrics, prediction, report
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
@@ -43,14 +43,16 @@ def test_interval_holds_the_ratio(rng: np.random.Generator) -> None:
 
 
 def test_calibration_error_of_known_scores() -> None:
-    assert grasping.calibration_error(np.full(10, 0.95), np.ones(10)) == pytest.approx(0.05)
-    assert grasping.calibration_error(np.full(10, 0.95), np.zeros(10)) == pytest.approx(0.95)
+    for success, error in ((1, 0.05), (0, 0.95)):
+        found = grasping.calibration(np.full(10, 0.95), np.full(10, success))
+        assert found["expected_calibration_error"] == pytest.approx(error)
+        assert found["reliability/9/count"] == 10 and found["reliability/9/success"] == success
 
 
 def _ended(name: str, steps: list[str], removed: int, objects: int) -> instances.Instance:
     instance = instances.Instance("x", None, np.zeros((1, 7)), objects)  # type: ignore[arg-type]
     instance.ended, instance.removed = name, removed
-    instance.film = [{"what": step} for step in steps]
+    instance.did = steps
     instance.pushes, instance.held = steps.count("push"), steps.count("grasp held")
     instance.grasps = len(steps) - instance.pushes
     return instance
@@ -122,8 +124,11 @@ def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> N
 def test_grasp_evaluation_writes_what_it_promises(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
-    values = grasping.evaluate(runs["grasp"], engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3)
-    assert values["attempts"] == 3
+    scorer = policy.load_scorer(runs["grasp"])
+    values, tables = grasping.evaluate(scorer, engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3, others=2)
+    assert values["attempts"] == sum(table.grasps for table in tables) >= 3 and values["scenes"] == 3
+    assert sum(value for key, value in values.items() if key.startswith("table/")) == 3
+    assert 0 <= values["other_grasps/ceiling"] <= 1
     for name in ("gn", "random_foreground"):
         assert 0 <= values[f"grasp_success/{name}_low"] <= values[f"grasp_success/{name}"] <= 1
 
@@ -166,12 +171,15 @@ def test_every_table_ends_by_the_rules(cleared: Any) -> None:
         assert table.ended in ("cleared", "pushed out", "out of actions")
         assert table.actions <= 3 * table.objects and table.actions == len(table.film)
         assert table.removed == table.objects - (table.scene.shape >= 0).sum()
-    kinds = {step["what"] for table in tables for step in table.film}
+    kinds = {step for table in tables for step in table.did}
     assert "push" in kinds and kinds & {"grasp held", "grasp missed"}
     listed = json.loads((out / "episodes.json").read_text())
     assert [entry["name"] for entry in listed] == ["06", "10"]
-    film = np.load(out / listed[0]["file"])
-    assert film["before"].shape[1:] == (224, 224, 3) and len(film["what"]) == len(tables[0].film)
+    reel = film.load(out / listed[0]["file"])
+    assert len(reel.what) == len(tables[0].film) == len(reel.poses) - 1
+    before, predicted, after = reel.pictures(len(reel.what) - 1)
+    assert before.shape == predicted.shape == after.shape == (224, 224, 3)
+    assert (before != after).any(), "an action leaves the table as it was"
 
 
 def test_the_report_is_one_file_with_its_pictures(
