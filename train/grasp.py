@@ -119,6 +119,11 @@ def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
     return jax.lax.map(one, episodes)
 
 
+def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
+    """Windows `[B]`, `pixels` a side, of episodes `[B]`; numpy."""
+    return jax.device_get(clutter.in_chunks(functools.partial(_windows, pixels=pixels), episodes))
+
+
 def executed_loss(model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
     """Cross entropy of executed grasps `[B]`, each moved by some pixels in its window and mirrored or not."""
     phase_key, flip_key = jax.random.split(key)
@@ -177,7 +182,7 @@ class GraspTask:
 
     def prepare(self, episodes: GraspEpisode) -> Window:
         """Windows `[B]` of episodes `[B]`, numpy."""
-        return jax.device_get(clutter.in_chunks(functools.partial(_windows, pixels=self.window), episodes))
+        return windows(episodes, pixels=self.window)
 
     def fetch(self, index: np.ndarray) -> Window:
         """See `loop.Task`."""

@@ -37,7 +37,15 @@ class TrainConfig:
     save_every: int = 200
 
 
-class Task(Protocol):
+class Taught(Protocol):
+    """What an optimizer step needs of a task."""
+
+    def loss(self, model: nnx.Module, batch: Any, key: jax.Array) -> jax.Array:
+        """Loss of a batch of examples, inside jit."""
+        ...
+
+
+class Task(Taught, Protocol):
     """Something to learn: data, a loss and a measure."""
 
     network: str  # key of checkpoint.NETWORKS
@@ -48,10 +56,6 @@ class Task(Protocol):
 
     def fetch(self, index: np.ndarray) -> Any:
         """The examples `index [B]`."""
-        ...
-
-    def loss(self, model: nnx.Module, batch: Any, key: jax.Array) -> jax.Array:
-        """Loss of a batch of examples, inside jit."""
         ...
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
@@ -78,7 +82,7 @@ def _split(model: nnx.Module) -> tuple[Any, Any, Any]:
     return parts
 
 
-def make_step(task: Task, graph: Any, optimizer: optax.GradientTransformation) -> Callable[..., Any]:
+def make_step(task: Taught, graph: Any, optimizer: optax.GradientTransformation) -> Callable[..., Any]:
     """`(params, rest, moments, batch, key) -> (params, rest, moments, loss)`, jitted; the first three are donated."""
 
     @functools.partial(jax.jit, donate_argnums=(0, 1, 2))

@@ -1,0 +1,207 @@
+"""GN learns while it grasps: act greedily on several tables at once, learn from each outcome (the paper's way)."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+from flax import nnx
+
+from dipn_jax import candidates, checkpoint, clutter, console, files, render, resume, structs
+from dipn_jax.networks.grasp import GraspConfig, score_image
+from dipn_jax.physics import Engine
+from dipn_jax.scenes import SceneConfig
+from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene, SettledScene
+from dipn_jax.workspace import WORKSPACE
+from train.grasp import PHASE, WINDOWS, Window, executed_loss, windows
+from train.loop import make_step
+
+PATIENCE = 3
+"""Grasps that miss in a row before a table is set anew."""
+RECENT = 50
+"""Grasps over which the success of the moment is counted."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OnlineConfig:
+    """How to learn."""
+
+    grasps: int = 300
+    tables: int = 10
+    updates: int = 10  # optimizer steps after each round of one grasp a table
+    batch: int = 32
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    seed: int = 0
+
+
+@dataclasses.dataclass
+class State:
+    """Everything that a run is at a moment."""
+
+    params: Any  # of the network
+    moments: Any  # of the optimizer
+    scene: Scene  # [T, N] the tables
+    poses: np.ndarray  # [T, N, 7]
+    spare: SettledScene  # tables to come
+    drawn: int = 0  # batches of tables that were drawn
+    round: int = 0
+    missed: list[int] = dataclasses.field(default_factory=list)  # [T] grasps in a row
+    seen: list[Window] = dataclasses.field(default_factory=list)  # what was tried, a batch a round
+    success: list[bool] = dataclasses.field(default_factory=list)  # in the order of the grasps
+
+
+def learn(
+    model: nnx.Module,
+    network_config: GraspConfig,
+    engine: Engine,
+    scenes: SceneConfig,
+    config: OnlineConfig,
+    out: pathlib.Path,
+) -> dict[str, float]:
+    """Learn online in the folder `out`; a run that was interrupted goes on.
+
+    Args:
+      model: network to begin with.
+      network_config: its architecture.
+      engine: physics.
+      scenes: what is grasped.
+      config: how.
+      out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
+
+    Returns:
+      Success over all grasps and over the last ones.
+    """
+    identity = {"initial_weights": checkpoint.digest(model), **dataclasses.asdict(config), "scenes": str(scenes)}
+    files.claim(out, identity)
+    ended = checkpoint.newest(out)
+    if ended:
+        return {name: ended[1][name] for name in ("success", "success_recent")}
+    partial = resume.Partial(out, identity)
+    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
+    )
+    step = make_step(_Outcomes(), graph, optimizer)
+    state: State = partial.load(None) or _begin(params, optimizer, engine, scenes, config)
+    total = -(-config.grasps // config.tables)
+    key = jax.random.key(config.seed)
+    with console.Progress("grasp and learn", total, unit="rounds", done=state.round) as progress:
+        while state.round < total:
+            _grasp(state, functools.partial(_choose, graph, state.params, rest), engine, scenes, config)
+            state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
+            state.round += 1
+            partial.save(state)
+            _log(out, state, config)
+            progress.advance(1, f"{np.mean(state.success[-RECENT:]):.2f} of the last {RECENT} held")
+    nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
+    extra = {"seed": config.seed, "examples": len(state.success)}
+    checkpoint.save(
+        out, len(state.success), {"model": nnx.state(model)}, network="grasp", config=network_config, extra=extra
+    )
+    partial.finish()
+    return {"success": float(np.mean(state.success)), "success_recent": float(np.mean(state.success[-RECENT:]))}
+
+
+class _Outcomes:
+    """What `make_step` wants to know of a task."""
+
+    def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
+        """Of executed grasps."""
+        return executed_loss(model, batch, key)
+
+
+def _begin(params: Any, optimizer: Any, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> State:
+    """The state before the first grasp."""
+    params = jax.device_get(params)
+    empty: Any = None
+    state = State(params, jax.device_get(optimizer.init(params)), empty, empty, empty)
+    state.missed = [0] * config.tables
+    _draw(state, engine, scenes, config)
+    first = structs.take(state.spare, slice(0, config.tables))
+    state.scene, state.poses = first.scene, first.poses
+    state.spare = structs.take(state.spare, slice(config.tables, None))
+    return state
+
+
+def _draw(state: State, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> None:
+    """More tables to come."""
+    key = jax.random.fold_in(jax.random.key(config.seed), state.drawn)
+    fresh = clutter.settled_exactly(key, engine, scenes, 2 * config.tables)
+    state.spare = fresh if state.spare is None else structs.concatenate([state.spare, fresh])
+    state.drawn += 1
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _choose(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) -> Grasp:
+    """The best grasp on each of the tables `[T]`."""
+    network = nnx.merge(graph, params, rest)
+    network.eval()
+
+    def one(args: tuple[Scene, jax.Array]) -> Grasp:
+        seen = render.render(*args)
+        index, _ = candidates.best_grasp(score_image(network, render.rgbd(seen)))
+        return candidates.grasp_at(index, seen.height)
+
+    return jax.lax.map(one, (scene, poses))
+
+
+def _grasp(
+    state: State, choose: Callable[..., Grasp], engine: Engine, scenes: SceneConfig, config: OnlineConfig
+) -> None:
+    """One grasp on every table; what is held is taken away; tables that are empty, or stuck, are set anew."""
+    taken = jax.device_get(choose(state.scene, state.poses))
+    scene, poses, held, fault = clutter.grasp_away(engine, state.scene, state.poses, taken)
+    good = np.asarray((fault & Fault.UNUSABLE) == 0)
+    success = held.any(1)
+    tried = GraspEpisode(state.scene, state.poses, poses, taken, held, success, fault)
+    if good.any():
+        state.seen.append(windows(structs.take(tried, good), pixels=WINDOWS["compact"] + 2 * PHASE))
+    state.success += success[good].tolist()
+    missed = np.where(success, 0, np.array(state.missed) + 1)
+    outside = ((np.abs(poses[..., :2]) > WORKSPACE.half).any(-1) & (scene.shape >= 0)).any(1)
+    over: np.ndarray = ~good | outside | (missed >= PATIENCE) | ~(scene.shape >= 0).any(1)
+    state.scene, state.poses, state.missed = scene, poses.copy(), np.where(over, 0, missed).tolist()
+    while len(np.asarray(state.spare.fault)) < over.sum():
+        _draw(state, engine, scenes, config)
+    fresh, state.spare = (
+        structs.take(state.spare, slice(0, over.sum())),
+        structs.take(state.spare, slice(over.sum(), None)),
+    )
+    state.poses[over] = fresh.poses
+    state.scene = jax.tree.map(functools.partial(_replaced, over), state.scene, fresh.scene)
+
+
+def _replaced(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    result = np.array(old)
+    result[where] = new
+    return result
+
+
+def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineConfig, key: jax.Array) -> tuple[Any, Any]:
+    """Some optimizer steps on everything tried so far."""
+    if not state.seen:
+        return state.params, state.moments
+    seen = structs.concatenate(state.seen)
+    rng = np.random.default_rng([config.seed, state.round])
+    params, moments = jax.tree.map(jax.numpy.array, (state.params, state.moments))
+    for k in range(config.updates):
+        batch = structs.take(seen, rng.integers(len(seen.success), size=config.batch))
+        params, rest, moments, _ = step(
+            params, jax.tree.map(jax.numpy.array, rest), moments, batch, jax.random.fold_in(key, k)
+        )
+    return jax.device_get((params, moments))
+
+
+def _log(out: pathlib.Path, state: State, config: OnlineConfig) -> None:
+    """`metrics.jsonl`: after so many grasps, success over the last ones."""
+    counts = range(config.tables, len(state.success) + 1, config.tables)
+    rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT) : n]))} for n in counts]
+    files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
