@@ -160,21 +160,20 @@ def _grasp(
     taken = jax.device_get(choose(state.scene, state.poses))
     scene, poses, held, fault = clutter.grasp_away(engine, state.scene, state.poses, taken)
     good = np.asarray((fault & Fault.UNUSABLE) == 0)
-    success = held.any(1)
+    success = np.asarray(held.any(1))
     tried = GraspEpisode(state.scene, state.poses, poses, taken, held, success, fault)
     if good.any():
         state.seen.append(windows(structs.take(tried, good), pixels=WINDOWS["compact"] + 2 * PHASE))
-    state.success += success[good].tolist()
+    state.success += [bool(one) for one in np.asarray(success)[good]]
     missed = np.where(success, 0, np.array(state.missed) + 1)
     outside = ((np.abs(poses[..., :2]) > WORKSPACE.half).any(-1) & (scene.shape >= 0)).any(1)
-    over: np.ndarray = ~good | outside | (missed >= PATIENCE) | ~(scene.shape >= 0).any(1)
-    state.scene, state.poses, state.missed = scene, poses.copy(), np.where(over, 0, missed).tolist()
-    while len(np.asarray(state.spare.fault)) < over.sum():
+    again = ~good | outside | (missed >= PATIENCE) | ~(scene.shape >= 0).any(1)
+    over = np.flatnonzero(again)
+    state.scene, state.poses, state.missed = scene, poses.copy(), np.where(again, 0, missed).tolist()
+    while len(np.asarray(state.spare.fault)) < len(over):
         _draw(state, engine, scenes, config)
-    fresh, state.spare = (
-        structs.take(state.spare, slice(0, over.sum())),
-        structs.take(state.spare, slice(over.sum(), None)),
-    )
+    fresh = structs.take(state.spare, slice(0, len(over)))
+    state.spare = structs.take(state.spare, slice(len(over), None))
     state.poses[over] = fresh.poses
     state.scene = jax.tree.map(functools.partial(_replaced, over), state.scene, fresh.scene)
 
