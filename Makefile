@@ -45,6 +45,7 @@ bench: setup
 PUSH := results/push
 TRAIN_PUSH := $(BIN)/dipn-train push --data $(PUSH)/data --eval-every 1000 --save-every 1000
 SHIFT := $(BIN)/dipn-eval prediction --push-net builtin --scenes 500 --no-segmented
+UNSEEN := $(BIN)/dipn-eval prediction --scenes 500 --objects paper --no-segmented
 push-figures: setup
 	$(BIN)/dipn-datagen push --out $(PUSH)/data --episodes 52000
 	for seed in 0 1 2; do for run in 100:600 300:1000 500:1500 1000:2500 1500:3000 51000:10000; do \
@@ -63,6 +64,17 @@ push-figures: setup
 	$(SHIFT) --objects paper --friction 0.1 0.2 --out $(PUSH)/shift-slipperier
 	$(SHIFT) --objects paper --friction 0.5 0.7 --out $(PUSH)/shift-stickier
 	$(SHIFT) --objects 8:15 --out $(PUSH)/shift-crowded
+	for run in "cuboid:cuboid_half cuboid_flat cuboid_long cube cuboid_mid cuboid_square" "cylinder:cylinder cylinder_flat" \
+	  "half_cylinder:half_cylinder half_cylinder_large" "triangular_prism:triangle triangle_flat" "concave:concave concave_slim"; do \
+	  $(TRAIN_PUSH) --limit 1500 --steps 3000 --without $${run%:*} --out $(PUSH)/no-$${run%:*} || exit; \
+	  $(UNSEEN) --items $${run#*:} --push-net $(PUSH)/no-$${run%:*} --out $(PUSH)/without-$${run%:*} || exit; \
+	  $(UNSEEN) --items $${run#*:} --push-net $(PUSH)/runs/1500-0 --no-physics --out $(PUSH)/with-$${run%:*} || exit; \
+	done
+	$(BIN)/dipn-datagen push --out $(PUSH)/crowds --objects 8:15 --episodes 6600
+	$(BIN)/dipn-train push --data $(PUSH)/crowds --limit 1500 --steps 3000 --out $(PUSH)/crowd
+	for run in crowded:crowd few:runs/1500-0; do \
+	  $(BIN)/dipn-eval prediction --scenes 500 --objects 8:15 --no-segmented --no-physics --push-net $(PUSH)/$${run#*:} --out $(PUSH)/crowd-$${run%:*} || exit; \
+	done
 	$(BIN)/python docs/push_prediction.py $(PUSH)
 
 clean-demo:

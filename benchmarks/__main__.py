@@ -41,6 +41,14 @@ BENCHMARKS = {
         "share of a training step of the compact DIPN that its inputs take", "<= 0.2", "push_net:input_share"
     ),
     "push_net.batched": Benchmark("64 candidate pushes in one call over a call for each", "none", "push_net:batched"),
+    "bench_grasp.scoring": Benchmark(
+        "seconds of all scores of an image over the published network's in PyTorch: compact (<= 1/30), paper",
+        "<= 1",
+        "bench_grasp:scoring",
+    ),
+    "bench_grasp.vs_torch": Benchmark(
+        "training samples a second of both GNs over the same in PyTorch, and memory", ">= 1", "bench_grasp:training"
+    ),
     "rates": Benchmark("episodes a second of each engine, 1 to 30 objects", "none", "rates:rates"),
 }
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import functools
 import importlib.util
 import pathlib
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from typing import Any
@@ -18,6 +16,7 @@ from flax import nnx
 
 from benchmarks import push_worker
 from benchmarks.harness import Setting, Skipped, alternate, quiet
+from benchmarks.worker import Worker
 from datagen.generate import Job, generate
 from dipn_jax import candidates, checkpoint, clutter, policy, scenes, structs
 from dipn_jax.networks.dipn import DipnConfig
@@ -38,39 +37,6 @@ def _task(folder: str, preset: str, seed: int) -> PushTask:
     return PushTask(data, DipnConfig(preset=preset), limit=None, centimetres=tuple(range(1, 11)))
 
 
-class Worker:
-    """A `push_worker` process."""
-
-    def __init__(self, framework: str, preset: str, batch: int, file: pathlib.Path) -> None:
-        """Start it; the first step, which compiles, is not counted."""
-        command = [sys.executable, "-m", "benchmarks.push_worker", framework, preset, str(batch), str(file)]
-        root = pathlib.Path(__file__).parent.parent
-        self.process = subprocess.Popen(command, cwd=root, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        self.steps(1)
-
-    def steps(self, count: int) -> float:
-        """Seconds that so many steps take."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{count}\n")
-        self.process.stdin.flush()
-        return float(self._line())
-
-    def close(self) -> tuple[int, float]:
-        """Number of parameters, and peak memory in MiB."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        parameters, memory = self._line().split()
-        self.process.wait()
-        return int(parameters), float(memory)
-
-    def _line(self) -> str:
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"{' '.join(map(str, self.process.args))}: ended early")  # type: ignore[arg-type]
-        return line
-
-
 def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
     """Seconds of a training step in PyTorch over ours, and our peak memory over PyTorch's, same layers and inputs."""
     if importlib.util.find_spec("torch") is None:
@@ -82,7 +48,7 @@ def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
             arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
             file = pathlib.Path(name) / "examples.npz"
             np.savez(file, target=np.asarray(examples.target), **arrays)  # type: ignore[arg-type]
-            workers = [Worker(framework, preset, batch, file) for framework in ("jax", "torch")]
+            workers = [Worker("push_worker", framework, preset, batch, file) for framework in ("jax", "torch")]
             count = 1 if preset == "paper" else setting.pick(10, 40)
             ours, theirs = alternate(
                 *[functools.partial(worker.steps, count) for worker in workers], repeats=setting.pick(3, 9)

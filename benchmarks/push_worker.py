@@ -2,24 +2,20 @@
 peak memory is its own.
 
 `python -m benchmarks.push_worker FRAMEWORK PRESET BATCH FILE.npz`: inputs `[B, ...]` and `target [B, N, 10, 3]` are in
-the file; a line with a number on standard input is answered by the seconds that so many steps took, the end of input by
-the number of parameters and the highest resident memory in MiB.
+the file. See `benchmarks.worker` for what it reads and answers.
 """
 
 from __future__ import annotations
 
-import pathlib
-import resource
 import sys
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from benchmarks import worker
+from benchmarks.worker import Step
 from dipn_jax.workspace import PUSH_STEPS
 
-Step = Callable[[], None]
 RATE, MOMENTUM = 1e-3, 0.9
 FIELDS = ("push_map", "scene_map", "crops", "outlines", "centers", "present")
 
@@ -93,27 +89,12 @@ def _target(preset: str, target: np.ndarray) -> np.ndarray:
     return target[:, :, -1:] if preset == "paper" else target
 
 
-def peak_memory() -> float:
-    """Highest resident memory of this process, MiB; `ru_maxrss` would also count the parent's before the fork."""
-    status = pathlib.Path("/proc/self/status")
-    if status.exists():
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
-        return int(line.split()[1]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-
-
 def main() -> None:
     """Entry point of a worker."""
     framework, preset, batch, file = sys.argv[1:]
     with np.load(file) as stored:
         arrays = {name: stored[name][: int(batch)] for name in stored}
-    step, parameters = {"jax": jax_step, "torch": torch_step}[framework](preset, arrays)
-    for line in sys.stdin:
-        begun = time.perf_counter()
-        for _ in range(int(line)):
-            step()
-        print(time.perf_counter() - begun, flush=True)
-    print(parameters, peak_memory(), flush=True)
+    worker.serve(*{"jax": jax_step, "torch": torch_step}[framework](preset, arrays))
 
 
 if __name__ == "__main__":

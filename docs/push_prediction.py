@@ -1,6 +1,7 @@
 """The figures of docs/push-prediction.md: `python docs/push_prediction.py RESULTS` after the commands on that page.
 
-Gathers RESULTS/{curve,alone-*,shift-*}/metrics.json in docs/push-prediction.json; copies figures, prints tables.
+Gathers RESULTS/{curve,alone-*,shift-*,with-*,without-*,crowd-*}/metrics.json in docs/push-prediction.json; copies
+figures, prints tables.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import shutil
 import sys
 from typing import Any
 
-from dipn_jax import console, files
+from dipn_jax import console, files, shapes
 from eval import curve
 
 DOCS = pathlib.Path(__file__).parent
@@ -54,6 +55,39 @@ def alone_table(values: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def unseen_table(values: dict[str, Any]) -> str:
+    """Scenes of one class of shapes only: a network never shown that class, and one shown all; 1,500 pushes each."""
+    titles = [f"{at}, {which}" for at, which in COLUMNS]
+    lines = ["| shapes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
+    predictors = {
+        "DIPN, never shown them": ("without", "dipn"),
+        "DIPN, shown all": ("with", "dipn"),
+        "`physics`": ("without", "physics"),
+        "`trans`": ("without", "trans"),
+    }
+    for name in shapes.CLASSES:
+        for title, (folder, predictor) in predictors.items():
+            keys = [f"{folder}-{name}/push_error/{predictor}/{at}/{which}" for at, which in COLUMNS]
+            cells = [f"{values[key]:.3f}" for key in keys]
+            lines.append(f"| {name.replace('_', ' ')} | {title} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def crowd_table(values: dict[str, Any]) -> str:
+    """Scenes of 8 to 15 objects: networks trained on such scenes, and on 1 to 7."""
+    titles = [f"{at}, {which}" for at, which in COLUMNS]
+    lines = ["| trained on | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
+    trained = {
+        "crowd-few": "1,500 pushes, 1 to 7 objects",
+        "crowd-crowded": "1,500 pushes, 8 to 15 objects",
+        "shift-crowded": "51,000 pushes, 1 to 7 objects",
+    }
+    for folder, title in trained.items():
+        cells = [f"{values[f'{folder}/push_error/dipn/{at}/{which}']:.3f}" for at, which in COLUMNS]
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
 GOALS = [
     ("1,500 pushes, 1 - IoU, all objects", "push_error/curve/1500/{}/all/mean", "", (0.10, 0.16)),
     ("1,500 pushes, XOR / 2 true, all objects", "push_error_paper_measure/curve/1500/{}/all/mean", "", (0.06, 0.10)),
@@ -78,14 +112,22 @@ def goal_table(values: dict[str, Any]) -> str:
 def tables(values: dict[str, Any]) -> list[str]:
     """All tables of the page."""
     curves = [curve.table(values, which=which) for which in ("all", "moved")]
-    return [goal_table(values), *curves, alone_table(values), shift_table(values)]
+    return [
+        goal_table(values),
+        *curves,
+        alone_table(values),
+        shift_table(values),
+        unseen_table(values),
+        crowd_table(values),
+    ]
 
 
 def main() -> None:
     """Entry point."""
     results = pathlib.Path(sys.argv[1])
     values = files.read_json(results / "curve" / "metrics.json")
-    for folder in sorted([*results.glob("alone-*"), *results.glob("shift-*")]):
+    found_in = ("alone", "shift", "with", "without", "crowd")
+    for folder in sorted(each for name in found_in for each in results.glob(f"{name}-*")):
         found = files.read_json(folder / "metrics.json")
         values |= {f"{folder.name}/{key}": value for key, value in found.items() if key.startswith("push_")}
     files.write_json(DOCS / "push-prediction.json", values)

@@ -1,0 +1,82 @@
+"""GN: training and scoring against PyTorch."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import pathlib
+import tempfile
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from benchmarks.harness import Setting, Skipped, alternate
+from benchmarks.worker import Worker
+from dipn_jax import clutter, render, scenes
+from dipn_jax.networks.grasp import VIEW
+from dipn_jax.physics import make_engine
+
+BATCHES = {"compact": (32, 112), "paper": (2, VIEW)}
+"""Examples a training step, and pixels a side of each."""
+OBJECTS = 10
+
+
+def _need_torch() -> None:
+    if importlib.util.find_spec("torch") is None:
+        raise Skipped("PyTorch is not installed; run pip install torch (the extra `bench`)")
+
+
+def _sides(preset: str, work: str, file: pathlib.Path) -> list[Worker]:
+    return [Worker("grasp_worker", framework, preset, work, file) for framework in ("jax", "torch")]
+
+
+def _image(seed: int) -> np.ndarray:
+    """What the camera sees of a scene of ten objects `[224, 224, 4]`."""
+    items = clutter.settled_exactly(jax.random.key(seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
+    seen = jax.tree.map(lambda leaf: leaf[0], clutter.observe(items.scene, items.poses))
+    return np.asarray(render.rgbd(seen))
+
+
+def scoring(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of the 16 rotations of one image: ours over those of the published network in PyTorch."""
+    _need_torch()
+    with tempfile.TemporaryDirectory() as name:
+        file = pathlib.Path(name) / "image.npz"
+        np.savez(file, image=_image(setting.seed))
+        ours = {preset: Worker("grasp_worker", "jax", preset, "score", file) for preset in ("compact", "paper")}
+        other = Worker("grasp_worker", "torch", "paper", "score", file)
+        for preset, count in (("compact", 10), ("paper", 1)):
+            mine = functools.partial(ours[preset].steps, count)
+            taken, theirs = alternate(mine, functools.partial(other.steps, 1), repeats=setting.pick(3, 9))
+            yield f"bench_grasp.{preset}_vs_torch_paper", taken / count / theirs
+            yield f"bench_grasp.{preset}_vs_torch_paper/milliseconds", 1000 * taken / count
+        yield "bench_grasp.paper_vs_torch_paper/torch_milliseconds", 1000 * theirs
+        if ours["paper"].close()[0] != other.close()[0]:
+            raise RuntimeError("the two published networks have different numbers of parameters")
+        ours["compact"].close()
+
+
+def training(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Samples a second of a training step over those of the same layers in PyTorch, and our peak memory over its."""
+    _need_torch()
+    image = _image(setting.seed)
+    for preset, (batch, side) in BATCHES.items():
+        wide = np.pad(image, [(48, 48), (48, 48), (0, 0)])
+        begin = (wide.shape[0] - side) // 2
+        images = np.repeat(wide[None, begin : begin + side, begin : begin + side], batch, 0)
+        with tempfile.TemporaryDirectory() as name:
+            file = pathlib.Path(name) / "examples.npz"
+            success = (np.arange(batch) % 2).astype(np.float32)
+            np.savez(file, images=images, pixel=np.full((batch, 2), side // 2), success=success)
+            workers = _sides(preset, "train", file)
+            count = 1 if preset == "paper" else setting.pick(5, 20)
+            ours, theirs = alternate(
+                *[functools.partial(worker.steps, count) for worker in workers], repeats=setting.pick(3, 9)
+            )
+            (mine, memory), (others, their_memory) = [worker.close() for worker in workers]
+        if mine != others:
+            raise RuntimeError(f"{preset}: {mine} parameters against {others} in PyTorch: not the same network")
+        yield f"bench_grasp.vs_torch/{preset}", theirs / ours
+        yield f"bench_grasp.vs_torch/{preset}_samples_per_second", batch * count / ours
+        yield f"bench_grasp.vs_torch/{preset}_memory", memory / their_memory
