@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,7 @@ class Work:
     gripper: tuple[float, float, float]  # metres: half sides
     gripper_mass: float
     settle_time: float  # seconds
+    watch: bool = False  # look at the contacts after every step of the fall
 
 
 def ready(_: int) -> bool:
@@ -53,7 +56,7 @@ def episodes(work: Work) -> tuple[np.ndarray, np.ndarray]:
     """Drop, settle and push every scene.
 
     Returns:
-      Positions `[E, N, 3]` at the end, and the depths `[D]` (metres) of all contacts under load after settling.
+      Positions `[E, N, 3]` at the end, and, if watched, the depths `[D]` (metres) of all contacts during the fall.
     """
     import pybullet
 
@@ -61,8 +64,8 @@ def episodes(work: Work) -> tuple[np.ndarray, np.ndarray]:
     ends, depths = [], []
     for index in range(len(work.poses)):
         bodies, hand, held = _world(pybullet, client, work, index)
-        _steps(pybullet, client, work.settings, work.settle_time)
-        depths.append(_depths(pybullet, client, bodies))
+        look = functools.partial(_depths, bodies=bodies) if work.watch else _nothing
+        depths += _steps(pybullet, client, work.settings, work.settle_time, look)
         path = work.paths[index].copy()
         aimed = bodies[work.aimed[index]]
         path[:, :2] += pybullet.getBasePositionAndOrientation(aimed, physicsClientId=client)[0][:2]
@@ -74,7 +77,7 @@ def episodes(work: Work) -> tuple[np.ndarray, np.ndarray]:
         found = [pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0] for body in bodies]
         ends.append(np.array(found))
     pybullet.disconnect(client)
-    return np.array(ends), np.concatenate(depths)
+    return np.array(ends), np.concatenate([np.zeros(0), *depths])
 
 
 def _placed(bullet: Any, target: np.ndarray) -> tuple[list[float], tuple[float, ...]]:
@@ -82,9 +85,19 @@ def _placed(bullet: Any, target: np.ndarray) -> tuple[list[float], tuple[float, 
     return list(target[:3]), bullet.getQuaternionFromEuler([0.0, 0.0, float(target[3])])
 
 
-def _steps(bullet: Any, client: int, settings: Settings, duration: float) -> None:
+def _nothing(bullet: Any, client: int) -> np.ndarray:
+    return np.zeros(0)
+
+
+def _steps(
+    bullet: Any, client: int, settings: Settings, duration: float, look: Callable[..., np.ndarray] = _nothing
+) -> list[np.ndarray]:
+    """Step for `duration` seconds; what `look` sees after each step."""
+    seen = []
     for _ in range(round(duration / settings.timestep)):
         bullet.stepSimulation(physicsClientId=client)
+        seen.append(look(bullet, client))
+    return seen
 
 
 def _world(bullet: Any, client: int, work: Work, index: int) -> tuple[list[int], int, int]:
@@ -122,7 +135,7 @@ def _object(bullet: Any, client: int, work: Work, index: int, slot: int) -> int:
 
 
 def _depths(bullet: Any, client: int, bodies: list[int]) -> np.ndarray:
-    """Metres by which the objects sink into what carries them, one for each contact under load."""
+    """Metres by which the objects are in what they touch, one for each contact that is under load."""
     points = {}
     for body in bodies:
         for point in bullet.getContactPoints(body, physicsClientId=client):
