@@ -40,6 +40,7 @@ def push_batch(
     count: int,
     actions: int,
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,),
+    **_: Any,
 ) -> Batch:
     """`actions` different pushes on each of up to `count` settled scenes, each once for every one of `distances`."""
     drop, aim = jax.random.split(key)

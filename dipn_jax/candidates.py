@@ -152,7 +152,7 @@ def sample_grasps(
       scores: `[16, H, W]` in [0, 1].
       count: number of grasps.
       guided: share of grasps drawn in proportion to the squared odds of the score, traced.
-      hard: share drawn in proportion to the score's variance, score x (1 - score), traced.
+      hard: share drawn in proportion to the squared variance, (score x (1 - score))^2, traced.
     """
     kind_key, draw_key, random_key = jax.random.split(key, 3)
     kind = jax.random.uniform(kind_key, (count,))
@@ -160,7 +160,7 @@ def sample_grasps(
     yes, no = jnp.log(scores + 1e-6), jnp.log1p(1e-6 - scores)
 
     def draw(k: jax.Array, u: jax.Array) -> jax.Array:
-        weight = jnp.where(u < guided, 2 * (yes - no), yes + no) + on
+        weight = 2 * jnp.where(u < guided, yes - no, yes + no) + on
         flat = jnp.argmax(weight + jax.random.gumbel(k, weight.shape))
         return jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
 

@@ -151,9 +151,9 @@ def grasp_online(
     grasps: int = 300,
     objects: str = "10",
     tables: int = 10,
-    updates: int = 10,
+    updates: int = 20,
     batch: int = 32,
-    learning_rate: float = 1e-3,
+    learning_rate: float = 5e-4,
     weight_decay: float = 1e-4,
     seed: int = 0,
     engine: EngineName = "auto",
@@ -180,7 +180,7 @@ def grasp_online(
     console.require_between(0, 1, weight_decay=weight_decay)
     console.require_seed(seed)
     console.require_out(out)
-    config = online.OnlineConfig(grasps, tables, updates, batch, learning_rate, weight_decay, seed)
+    config = online.OnlineConfig(grasps, tables, updates, batch, learning_rate, weight_decay, seed, init is not None)
     model: Any
     if init:
         model = checkpoint.load_network(init, network="grasp")

@@ -35,11 +35,12 @@ class OnlineConfig:
 
     grasps: int = 300
     tables: int = 10
-    updates: int = 10  # optimizer steps after each round of one grasp a table
+    updates: int = 20  # optimizer steps after each round of one grasp a table
     batch: int = 32
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4
     weight_decay: float = 1e-4
     seed: int = 0
+    pretrained: bool = False  # whether the network has learnt from images; for the record
 
 
 @dataclasses.dataclass

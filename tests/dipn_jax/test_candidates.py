@@ -83,3 +83,29 @@ def test_best_grasp_is_the_highest() -> None:
     scores = jnp.zeros((16, 224, 224)).at[5, 17, 200].set(0.9)
     index, score = candidates.best_grasp(scores)
     assert index.tolist() == [5, 17, 200] and np.isclose(score, 0.9)
+
+
+def test_a_grasp_is_where_its_index_says() -> None:
+    index = np.array([[3, 100, 20], [15, 0, 223]])
+    taken = candidates.grasp_at(index, jnp.zeros((224, 224)))
+    np.testing.assert_array_equal(candidates.grasp_index(taken), index)
+
+
+def test_guided_grasps_are_where_the_scores_are_high_and_hard_ones_where_they_are_half() -> None:
+    label = jnp.full((224, 224), ABSENT).at[50:150, 50:150].set(0)
+    seen = Observation(jnp.where(label == 0, 0.05, 0.0), jnp.zeros((224, 224, 3)), label)
+    scores = jnp.full((16, 224, 224), 1e-3).at[5, 60:64, 60:64].set(0.99).at[9, 120:124, 120:124].set(0.5)
+    scores = scores.at[2, :40, :40].set(0.999)  # on the table: nothing to grasp
+
+    def rotations(guided: float, hard: float) -> np.ndarray:
+        taken = candidates.sample_grasps(jax.random.key(0), seen, scores, count=40, guided=guided, hard=hard)
+        return np.asarray(candidates.grasp_index(taken))[:, 0]
+
+    assert (rotations(1.0, 0.0) == 5).mean() > 0.9
+    assert (rotations(0.0, 1.0) == 9).mean() > 0.5
+    assert len(set(rotations(0.0, 0.0))) > 10, "the others are anywhere"
+
+
+def test_the_best_grasps_stand_apart() -> None:
+    scores = jnp.zeros((16, 64, 64)).at[0, 10, 10].set(0.9).at[1, 10, 12].set(0.8).at[2, 40, 40].set(0.7)
+    np.testing.assert_array_equal(candidates.best_grasps(scores, count=2), [[0, 10, 10], [2, 40, 40]])

@@ -178,6 +178,20 @@ def test_compact_grasp_scores_are_of_the_pixel_they_stand_at() -> None:
     assert np.corrcoef(np.ravel(quarter[4]), np.ravel(want))[0, 1] > 0.95
 
 
+def test_scores_by_tables_are_scores_of_turned_maps() -> None:
+    model = grasp.GraspNet(grasp.GraspConfig(width=8, coarse=8, blocks=1), rngs=nnx.Rngs(0))
+    model.eval()
+    table = jnp.array([*render.TABLE_COLOR, 0.0])
+    block = jnp.array([0.9, 0.1, 0.4, 0.05])
+    image = jnp.broadcast_to(table, (224, 224, 4)).at[80:130, 60:90].set(block)
+    half = jnp.asarray(grasp_angles())[:8]
+    views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, grasp.VIEW) + table)(half)
+    plain = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, 224))(nnx.sigmoid(model(views)), half)
+    quick = np.asarray(nnx.jit(grasp.score_image)(model, image))
+    assert (np.abs(quick[:8] - plain) < 1e-5).mean() > 0.999  # but for pixels at the border between two
+    np.testing.assert_array_equal(quick[8:], quick[:8])
+
+
 def test_geometric_labels_of_a_bar() -> None:
     # a bar 50 mm wide across the closing direction can be grasped at its middle, not from its end
     height = jnp.zeros((160, 160)).at[40:120, 68:93].set(0.05)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import candidates, checkpoint, geometry, render, shapes, structs
+from dipn_jax import candidates, checkpoint, geometry, render, scenes, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
+from train import grasp as grasp_task
+from train import online
 from train.grasp import PHASE, GraspTask, PretrainTask, view
 from train.loop import TrainConfig, fit, make_optimizer, make_step
 from train.push import PushTask
@@ -99,6 +101,41 @@ def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tm
     assert loss < 0.6 * entropy  # a constant gets 1.0
 
 
+@pytest.mark.slow
+def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pathlib.Path) -> None:
+    plan = online.OnlineConfig(grasps=6, tables=2, updates=2, batch=4)
+    network = GraspConfig(width=8, coarse=8, blocks=1)
+    scene = scenes.fixed_count(3, spread=0.2)
+
+    def learn(out: pathlib.Path) -> dict[str, float]:
+        return online.learn(checkpoint.build("grasp", network), network, engine, scene, plan, out)
+
+    whole = learn(tmp_path / "a")
+    with pytest.MonkeyPatch.context() as patch:
+
+        def stop(out: pathlib.Path, state: online.State, plan: online.OnlineConfig) -> None:
+            if state.round == 2:
+                raise KeyboardInterrupt
+
+        patch.setattr(online, "_log", stop)
+        with pytest.raises(KeyboardInterrupt):
+            learn(tmp_path / "b")
+    assert learn(tmp_path / "b") == whole == learn(tmp_path / "b")
+    first, second = (checkpoint.load_network(tmp_path / name, network="grasp") for name in "ab")
+    assert checkpoint.digest(first) == checkpoint.digest(second)
+    assert checkpoint.digest(first) != checkpoint.digest(checkpoint.build("grasp", network))
+    lines = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 4, 6]
+
+
+def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path]) -> None:
+    task = GraspTask((data["grasp"],), GraspConfig())
+    wide = grasp_task._widened(task.train_set, 7)
+    assert wide.scene.shape.shape[1] == 7 and (wide.scene.shape[:, 3:] == -1).all()
+    for a, b in zip(task.prepare(wide).height, task.prepare(task.train_set).height, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig(width=8))
     episodes = structs.take(task.train_set, np.arange(6))
@@ -139,8 +176,8 @@ def test_a_hard_stop_inside_a_line_of_metrics_is_survived(task: PushTask, tmp_pa
 
 def test_no_scene_is_on_both_sides_of_the_split(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig())
-    scenes = [{size.tobytes() for size in part.scene.size} for part in (task.train_set, task.test_set)]
-    assert not scenes[0] & scenes[1] and scenes[1]
+    seen = [{size.tobytes() for size in part.scene.size} for part in (task.train_set, task.test_set)]
+    assert not seen[0] & seen[1] and seen[1]
 
 
 def test_an_example_is_what_the_camera_shows_and_the_push_does(task: PushTask) -> None:
