@@ -13,7 +13,7 @@ import tyro
 from dipn_jax import checkpoint, console, files, policy, resume, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.physics import EngineName, make_engine
-from eval import clearing, grasping, metrics, prediction
+from eval import clearing, grasp_curve, grasping, metrics, prediction
 from eval import curve as curves
 from eval import instances as tables_to_clear
 from eval import report as reporting
@@ -112,8 +112,9 @@ def predict(
 
 
 def grasp(
-    grasp_net: pathlib.Path,
     out: pathlib.Path,
+    grasp_net: pathlib.Path | None = None,
+    curve: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="curve")] = (),
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 100,
     objects: Objects = "10",
     seed: int = 1_000_000,
@@ -125,9 +126,14 @@ def grasp(
 
       dipn-eval grasp --grasp-net builtin --out results/grasp
 
+    Success against grasps learnt from, with a band over seeds (curve.png, and in metrics.json
+    online/{with,without}/GRASPS/...):
+      dipn-eval grasp --curve runs/online/* --out results/curve
+
     Args:
+      out: folder for metrics.json, pictures and every step of every table.
       grasp_net: run of dipn-train grasp, or builtin.
-      out: folder for metrics.json, reliability.png and every step of every table.
+      curve: runs of dipn-train grasp-online of different --seed, with and without --init.
       scenes_: how many tables.
       objects: number of objects on a table.
       seed: of scenes and random grasps; keep it away from the training data's.
@@ -138,15 +144,24 @@ def grasp(
     settings = dict(locals())
     _check(out, seed, scenes=scenes_)
     console.require_between(0, 1024, others=others)
+    if not grasp_net and not curve:
+        raise UserError("grasp: nothing to measure; give --grasp-net or --curve")
     config = scenes.parse_objects(objects, ranges=ranges)
-    run = checkpoint.find(grasp_net, network="grasp")
-    partial = resume.Partial(out, settings, inputs=[run])
-    scorer = policy.load_scorer(run)
-    values, tables = grasping.evaluate(
-        scorer, make_engine(engine), config, partial, scenes=scenes_, seed=seed, others=others
-    )
-    clearing.save(tables, out)
-    grasping.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
+    run = checkpoint.find(grasp_net, network="grasp") if grasp_net else None
+    partial = resume.Partial(out, settings, inputs=[run] if run else [])
+    values: dict[str, Any] = grasp_curve.summary(grasp_curve.load(curve))
+    if run:
+        physics = make_engine(engine)
+        found, tables = grasping.evaluate(
+            policy.load_scorer(run), physics, config, partial, scenes=scenes_, seed=seed, others=others
+        )
+        alone = grasping.label_agreement(physics, scenes.parse_objects("1", ranges=ranges), scenes=scenes_, seed=seed)
+        values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
+        clearing.save(tables, out)
+        grasping.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
+    if curve:
+        out.mkdir(parents=True, exist_ok=True)
+        grasp_curve.figure(values).savefig(out / "curve.png", dpi=130)
     _finish(out, values, settings, partial)
 
 

@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from dipn_jax import candidates, clutter, console, policy, primitives, render, resume, structs
+from dipn_jax.networks.grasp import label_image
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Scorer
 from dipn_jax.scenes import SceneConfig
@@ -138,6 +139,39 @@ def _next_best(scene: Scene, poses: jax.Array, *, scorer: Scorer, count: int) ->
         return candidates.grasp_at(candidates.best_grasps(scores, count=count), seen.height)
 
     return jax.lax.map(one, (scene, poses))
+
+
+def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: int, each: int = 4) -> dict[str, float]:
+    """How often the labels of pre-training say what physics says, of random grasps of the foreground.
+
+    Args:
+      engine: physics.
+      config: scenes; one object in each to see what the rule is worth by itself.
+      scenes: how many.
+      seed: of scenes and grasps.
+      each: grasps on every scene.
+    """
+    items = clutter.settled_exactly(jax.random.key(seed), engine, config, scenes)
+    keys = jax.random.split(jax.random.key(seed), scenes)
+    grasps, labels = clutter.in_chunks(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
+    flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
+    index = np.repeat(np.arange(scenes), each)
+    rollout, outcome = primitives.grasp(engine, structs.take(items.scene, index), items.poses[index], flat)
+    good = _usable(rollout.fault)
+    said, held = np.asarray(labels).reshape(-1)[good] > 0.5, np.asarray(outcome.success)[good]
+    rates = {"agree": said == held, "positive_holds": held[said], "negative_fails": ~held[~said], "positive": said}
+    return {"grasps": len(said)} | {name: float(np.mean(rate)) for name, rate in rates.items()}
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _labelled(keys: jax.Array, scene: Scene, poses: jax.Array, *, count: int) -> tuple[Grasp, jax.Array]:
+    def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Grasp, jax.Array]:
+        seen = render.render(*args[1:])
+        grasps = candidates.random_grasps(args[0], seen, count=count)
+        rotation, row, col = candidates.grasp_index(grasps).T
+        return grasps, label_image(seen.height)[rotation, row, col]
+
+    return jax.lax.map(one, (keys, scene, poses))
 
 
 def calibration(scores: np.ndarray, success: np.ndarray) -> dict[str, float]:

@@ -203,3 +203,13 @@ def geometric_labels(height: jax.Array) -> jax.Array:
     rows = round(GRIPPER.pad_width / 2 / WORKSPACE.pixel)
     fingers = jnp.maximum(highest(-far, -near, rows), highest(near, far, rows))
     return ((height > tip + MIN_DEPTH) & (fingers < tip)).astype(jnp.float32)
+
+
+def label_image(height: jax.Array) -> jax.Array:
+    """`geometric_labels` of every grasp on a height map `[224, 224]`: `[16, 224, 224]`, as `score_image`."""
+
+    def one(angle: jax.Array) -> jax.Array:
+        labels = geometric_labels(geometry.rotate_map(height, angle, VIEW))
+        return geometry.unrotate_map(labels, angle, WORKSPACE.pixels)
+
+    return jax.lax.map(one, jnp.asarray(grasp_angles()))

@@ -133,6 +133,12 @@ def test_grasp_evaluation_writes_what_it_promises(
         assert 0 <= values[f"grasp_success/{name}_low"] <= values[f"grasp_success/{name}"] <= 1
 
 
+def test_labels_of_pretraining_mostly_say_what_physics_says(engine: Any) -> None:
+    found = grasping.label_agreement(engine, scenes.fixed_count(1), scenes=16, seed=0)
+    assert found["grasps"] > 48 and 0.1 < found["positive"] < 0.9
+    assert found["agree"] > 0.7
+
+
 @pytest.fixture(scope="module")
 def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Two hard cases acted on by networks that know nothing: one by grasps, one by pushes."""
