@@ -1,12 +1,12 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html (15 minutes on 2 cores)
 # make test   lint, types, tests
 # make bench  the figures of docs/benchmarks.md
-# make push-figures  those of docs/push-prediction.md
+# make push-figures, make grasp-figures  those of docs/push-prediction.md and docs/grasping.md
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: setup demo test lint bench push-figures clean-demo
+.PHONY: setup demo test lint bench push-figures grasp-figures clean-demo
 
 setup: .venv/.installed
 
@@ -76,6 +76,27 @@ push-figures: setup
 	  $(BIN)/dipn-eval prediction --scenes 500 --objects 8:15 --no-segmented --no-physics --push-net $(PUSH)/$${run#*:} --out $(PUSH)/crowd-$${run%:*} || exit; \
 	done
 	$(BIN)/python docs/push_prediction.py $(PUSH)
+
+# learning curves, the network that comes with the package, and everything else on docs/grasping.md (two hours on 2 cores)
+GRASP := results/grasp
+GUIDED := $(BIN)/dipn-datagen grasp --actions
+grasp-figures: setup
+	$(BIN)/dipn-datagen images --out $(GRASP)/images --episodes 100
+	$(BIN)/dipn-train grasp-pretrain --data $(GRASP)/images --out $(GRASP)/pretrained --steps 400
+	for seed in 0 1 2 3 4 5 6 7; do \
+	  $(BIN)/dipn-train grasp-online --init $(GRASP)/pretrained --seed $$seed --grasps 400 --out $(GRASP)/runs/with-$$seed || exit; \
+	done
+	for seed in 0 1 2 3; do \
+	  $(BIN)/dipn-train grasp-online --seed $$seed --grasps 400 --out $(GRASP)/runs/without-$$seed || exit; \
+	done
+	$(BIN)/dipn-eval grasp --curve $(GRASP)/runs/* --out $(GRASP)/online
+	$(GUIDED) 6 --objects 1:12 --episodes 12000 --grasp-net $(GRASP)/pretrained --out $(GRASP)/first
+	$(BIN)/dipn-train grasp --data $(GRASP)/first --init $(GRASP)/pretrained --steps 1500 --batch 64 --learning-rate 2e-3 --out $(GRASP)/once
+	$(GUIDED) 8 --objects 1:20 --episodes 6000 --seed 1 --grasp-net $(GRASP)/once --guided 0.6 --hard 0.3 --out $(GRASP)/second
+	$(BIN)/dipn-train grasp --data $(GRASP)/first $(GRASP)/second --init $(GRASP)/pretrained --steps 2500 --batch 64 --learning-rate 2e-3 --out $(GRASP)/twice
+	$(BIN)/dipn-eval grasp --grasp-net $(GRASP)/twice --scenes 200 --others 16 --out $(GRASP)/builtin-10
+	$(BIN)/dipn-eval grasp --grasp-net $(GRASP)/twice --scenes 30 --objects 30 --others 16 --out $(GRASP)/builtin-30
+	$(BIN)/python docs/grasping.py $(GRASP)
 
 clean-demo:
 	rm -rf $(DEMO)

@@ -38,26 +38,35 @@ def _image(seed: int) -> np.ndarray:
     return np.asarray(render.rgbd(seen))
 
 
-def scoring(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of the 16 rotations of one image: ours over those of the published network in PyTorch."""
+def compact_vs_torch_paper(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of the 16 rotations of one image: `compact` over the published network in PyTorch."""
+    yield from _scoring(setting, "compact", 10)
+
+
+def paper_vs_torch_paper(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds of the 16 rotations of one image: the published network over the same in PyTorch."""
+    yield from _scoring(setting, "paper", 1)
+
+
+def _scoring(setting: Setting, preset: str, count: int) -> Iterator[tuple[str, float]]:
     _need_torch()
     with tempfile.TemporaryDirectory() as name:
         file = pathlib.Path(name) / "image.npz"
         np.savez(file, image=_image(setting.seed))
-        ours = {preset: Worker("grasp_worker", "jax", preset, "score", file) for preset in ("compact", "paper")}
+        ours = Worker("grasp_worker", "jax", preset, "score", file)
         other = Worker("grasp_worker", "torch", "paper", "score", file)
-        for preset, count in (("compact", 10), ("paper", 1)):
-            mine = functools.partial(ours[preset].steps, count)
-            taken, theirs = alternate(mine, functools.partial(other.steps, 1), repeats=setting.pick(3, 9))
-            yield f"bench_grasp.{preset}_vs_torch_paper", taken / count / theirs
-            yield f"bench_grasp.{preset}_vs_torch_paper/milliseconds", 1000 * taken / count
-        yield "bench_grasp.paper_vs_torch_paper/torch_milliseconds", 1000 * theirs
-        if ours["paper"].close()[0] != other.close()[0]:
-            raise RuntimeError("the two published networks have different numbers of parameters")
-        ours["compact"].close()
+        sides = [functools.partial(ours.steps, count), functools.partial(other.steps, 1)]
+        taken, theirs = alternate(*sides, repeats=setting.pick(3, 9))
+        mine, others = ours.close()[0], other.close()[0]
+    if preset == "paper" and mine != others:
+        raise RuntimeError(f"{mine} parameters against {others} in PyTorch: not the same network")
+    figure = f"bench_grasp.{preset}_vs_torch_paper"
+    yield figure, taken / count / theirs
+    yield f"{figure}/milliseconds", 1000 * taken / count
+    yield f"{figure}/torch_milliseconds", 1000 * theirs
 
 
-def training(setting: Setting) -> Iterator[tuple[str, float]]:
+def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
     """Samples a second of a training step over those of the same layers in PyTorch, and our peak memory over its."""
     _need_torch()
     image = _image(setting.seed)

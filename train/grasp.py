@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import clutter, console, geometry, losses, records, render, scenes, structs
+from dipn_jax import clutter, console, geometry, losses, records, render, scenes, shapes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks import grasp
 from dipn_jax.structs import ABSENT, Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
@@ -125,8 +125,11 @@ def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
 
 
 def executed_loss(model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
-    """Cross entropy of executed grasps `[B]`, each moved by some pixels in its window and mirrored or not."""
-    phase_key, flip_key = jax.random.split(key)
+    """Cross entropy of executed grasps `[B]`: each moved by some pixels, mirrored or not, objects in new colours."""
+    phase_key, flip_key, color_key = jax.random.split(key, 3)
+    palette = jnp.asarray(shapes.COLORS_RGB, jnp.float32) / 255
+    drawn = jax.random.randint(color_key, batch.color.shape[:2], 0, len(palette))
+    batch = batch.replace(color=palette[drawn])  # what an object is like is not in its colour
     images, pixel = view(batch, jax.random.randint(phase_key, (len(batch.success), 2), 0, 2 * PHASE))
     mask = jnp.zeros(images.shape[:3]).at[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]].set(1.0)
     images, mask = _flips(flip_key, images, mask)

@@ -1,5 +1,6 @@
-"""Learning curves of grasping: means and bands over seeds."""
+"""Learning curves of grasping: means and bands over seeds; the page in docs shows the figures in docs."""
 
+import importlib.util
 import json
 import pathlib
 
@@ -7,6 +8,8 @@ import pytest
 
 from dipn_jax.errors import UserError
 from eval import grasp_curve
+
+DOCS = pathlib.Path(__file__).parents[2] / "docs"
 
 
 def _run(folder: pathlib.Path, pretrained: bool, success: list[float]) -> pathlib.Path:
@@ -35,3 +38,13 @@ def test_another_run_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(UserError, match="no run of dipn-train grasp-online"):
         grasp_curve.load([tmp_path])
+
+
+def test_the_page_in_docs_shows_the_figures_in_docs() -> None:
+    place = importlib.util.spec_from_file_location("grasping_page", DOCS / "grasping.py")
+    assert place is not None and place.loader is not None
+    page = importlib.util.module_from_spec(place)
+    place.loader.exec_module(page)
+    text = (DOCS / "grasping.md").read_text()
+    for table in page.tables(json.loads((DOCS / "grasping.json").read_text())):
+        assert table in text
