@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 SMALL = 4
@@ -17,7 +18,7 @@ class Conv(nnx.Conv):
     """`nnx.Conv` in the form that XLA differentiates fastest on a CPU; the same function and parameters.
 
     Measured forward and backward on two cores: a 1x1 as a matrix product is 1.5 to 6 times as fast, a 3x3 of 512
-    channels on 56 maps of 2x2 pixels 70 times.
+    channels on 56 maps of 2x2 pixels 70 times, an 11x57 of one channel 10 times.
     """
 
     def __call__(self, x: jax.Array) -> jax.Array:  # type: ignore[override]
@@ -26,9 +27,21 @@ class Conv(nnx.Conv):
         size, step = kernel.shape[0], self.strides[0]  # type: ignore[index]
         if kernel.shape[:2] == (1, 1):
             return x[:, ::step, ::step] @ kernel[0, 0] + bias
+        if kernel.shape[2:] == (1, 1) and step == 1:
+            return _banded(x[..., 0], kernel[..., 0, 0])[..., None] + bias
         if size == kernel.shape[1] and max(x.shape[1:3]) <= SMALL * step:
             return _patches(x, size, step) @ kernel.reshape(-1, kernel.shape[-1]) + bias
         return super().__call__(x)
+
+
+def _banded(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """A convolution of maps `[B, H, W]` of one channel, kernel of odd sides: a matrix product for each of its rows."""
+    (rows, cols), (height, width) = kernel.shape, x.shape[1:]
+    offset = np.arange(width)[:, None] - np.arange(width) + cols // 2
+    inside = (offset >= 0) & (offset < cols)
+    bands = jnp.where(inside, kernel[:, np.clip(offset, 0, cols - 1)], 0.0)
+    x = jnp.pad(x, ((0, 0), (rows // 2, rows // 2), (0, 0)))
+    return sum(x[:, i : i + height] @ bands[i] for i in range(rows))  # type: ignore[return-value]
 
 
 def _patches(x: jax.Array, size: int, step: int) -> jax.Array:

@@ -12,13 +12,25 @@ from dipn_jax.networks import resnet
 
 
 @pytest.mark.parametrize(
-    ("side", "size", "stride"), [(6, 1, 1), (7, 1, 2), (4, 3, 1), (2, 3, 1), (8, 3, 2), (7, 3, 2), (9, 3, 1)]
+    ("side", "size", "stride", "features"),
+    [
+        (6, 1, 1, (3, 5)),
+        (7, 1, 2, (3, 5)),
+        (4, 3, 1, (3, 5)),
+        (2, 3, 1, (3, 5)),
+        (8, 3, 2, (3, 5)),
+        (7, 3, 2, (3, 5)),
+        (9, 3, 1, (3, 5)),
+        (9, (3, 7), 1, (1, 1)),
+    ],
 )
-def test_convolution_and_its_gradients_are_those_of_flax(side: int, size: int, stride: int) -> None:
+def test_convolution_and_its_gradients_are_those_of_flax(
+    side: int, size: int | tuple[int, int], stride: int, features: tuple[int, int]
+) -> None:
     rng = np.random.default_rng(0)
-    layer = resnet.conv(3, 5, size, nnx.Rngs(0), stride=stride)
-    layer.bias[...] = jnp.asarray(rng.normal(size=5), jnp.float32)
-    x = jnp.asarray(rng.normal(size=(2, side, side, 3)), jnp.float32)
+    layer = resnet.conv(*features, size, nnx.Rngs(0), stride=stride)
+    layer.bias[...] = jnp.asarray(rng.normal(size=features[1]), jnp.float32)
+    x = jnp.asarray(rng.normal(size=(2, side, side, features[0])), jnp.float32)
     graph, state = nnx.split(layer)
 
     def ours(state: nnx.State, x: jax.Array) -> jax.Array:
