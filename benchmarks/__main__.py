@@ -54,7 +54,9 @@ BENCHMARKS = {
     "bench_grasp.vs_torch": Benchmark(
         "training samples a second of both GNs over the same in PyTorch, and memory", ">= 1", "bench_grasp:vs_torch"
     ),
-    "rates": Benchmark("episodes a second of each engine, 1 to 30 objects", "none", "rates:rates"),
+    "rates.native": Benchmark("episodes a second of MuJoCo C, 1 to 30 objects", "none", "rates:native"),
+    "rates.mjx": Benchmark("episodes a second of MJX, 1 to 30 objects", "none", "rates:mjx"),
+    "rates.warp": Benchmark("episodes a second of MuJoCo Warp, 1 to 30 objects", "none", "rates:warp"),
 }
 
 

@@ -21,7 +21,7 @@ def tables(figures: Figures) -> str:
     rates: dict[str, dict[int, float]] = {}
     for name, value in figures.items():
         base = next(known for known in BENCHMARKS if name == known or name.startswith((f"{known}/", f"{known}.")))
-        if base == "rates":
+        if base.startswith("rates."):
             kind, _, count = name.removeprefix("rates.").rpartition("/")
             rates.setdefault(kind.replace("/", ", "), {})[int(count)] = value
         else:

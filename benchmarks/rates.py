@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 from collections.abc import Iterator
 from unittest import mock
 
@@ -10,24 +11,25 @@ import jax
 
 from benchmarks.datagen_mjx import engine as mjx_engine
 from benchmarks.datagen_native import ACTIONS
-from benchmarks.harness import Setting, make_data, seconds
+from benchmarks.harness import Setting, Skipped, make_data, seconds
 from datagen import generate
 from dipn_jax import scenes
-from dipn_jax.physics import EngineName
+from dipn_jax.physics import EngineName, make_engine
 
 COUNTS = (1, 3, 7, 10, 20, 30)
-MOST_ON_CPU = 10
-"""Objects that XLA on a CPU can simulate in bearable time."""
+FEW_ON_CPU = 4
+"""Episodes that XLA and Warp make of each kind on a CPU at small scale: their rate is below one a second."""
 
 
 def _engine_kept(engine: EngineName) -> contextlib.AbstractContextManager[object]:
-    """Every data set makes its engine anew; within this, MJX stays the one that has its programs compiled.
+    """Every data set makes its engine anew; within this, one stays that has its programs compiled.
 
     The native one is left alone: it remembers models, which a second run of the same job must not find.
     """
     if engine == "native":
         return contextlib.nullcontext()
-    return mock.patch.object(generate, "make_engine", lambda *_, **__: mjx_engine())
+    made = mjx_engine() if engine == "mjx" else make_engine(engine)
+    return mock.patch.object(generate, "make_engine", lambda *_, **__: made)
 
 
 def rate(engine: EngineName, kind: str, objects: int, episodes: int, seed: int) -> float:
@@ -40,16 +42,28 @@ def rate(engine: EngineName, kind: str, objects: int, episodes: int, seed: int) 
         return episodes / seconds(lambda: make_data(job))
 
 
-def rates(setting: Setting) -> Iterator[tuple[str, float]]:
-    """`rates.ENGINE/KIND/OBJECTS` for both engines and kinds."""
-    on_cpu = jax.default_backend() == "cpu"
-    plan: list[tuple[EngineName, int, tuple[int, ...]]] = [("native", setting.pick(96, 960), COUNTS)]
-    if on_cpu and setting.scale == "small":
-        plan.append(("mjx", 6, tuple(n for n in COUNTS if n <= MOST_ON_CPU)))
-    else:
-        plan.append(("mjx", 24 if on_cpu else setting.pick(384, 3840), COUNTS))
-    for engine, episodes, counts in plan:
-        for kind in ("push", "grasp"):
-            for objects in counts:
-                value = rate(engine, kind, objects, max(episodes * 7 // max(objects, 7), 4), setting.seed)
-                yield f"rates.{engine}/{kind}/{objects}", value
+def _rates(engine: EngineName, setting: Setting, episodes: int) -> Iterator[tuple[str, float]]:
+    """`rates.ENGINE/KIND/OBJECTS`; fewer episodes of many objects."""
+    for kind in ("push", "grasp"):
+        for objects in COUNTS:
+            value = rate(engine, kind, objects, max(episodes * 7 // max(objects, 7), 4), setting.seed)
+            yield f"rates.{engine}/{kind}/{objects}", value
+
+
+def native(setting: Setting) -> Iterator[tuple[str, float]]:
+    """MuJoCo C on all cores."""
+    return _rates("native", setting, setting.pick(96, 960))
+
+
+def mjx(setting: Setting) -> Iterator[tuple[str, float]]:
+    """MJX, XLA."""
+    few = setting.pick(FEW_ON_CPU, 24)
+    return _rates("mjx", setting, few if jax.default_backend() == "cpu" else setting.pick(384, 3840))
+
+
+def warp(setting: Setting) -> Iterator[tuple[str, float]]:
+    """MuJoCo Warp."""
+    if importlib.util.find_spec("warp") is None:
+        raise Skipped("MuJoCo Warp is not installed; run pip install 'dipn-jax[warp]'")
+    few = setting.pick(FEW_ON_CPU, 24)
+    return _rates("warp", setting, few if jax.default_backend() == "cpu" else setting.pick(384, 3840))
