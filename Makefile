@@ -41,7 +41,7 @@ bench: setup
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'
 	$(BIN)/python -m benchmarks all --scale full --out benchmarks.json
 
-# learning curves and everything else on docs/push-prediction.md (hours on 2 cores; goes on where it was stopped)
+# learning curves and everything else on docs/push-prediction.md (hours on 2 cores; data and trainings go on where they stopped)
 PUSH := results/push
 TRAIN_PUSH := $(BIN)/dipn-train push --data $(PUSH)/data --eval-every 1000 --save-every 1000
 SHIFT := $(BIN)/dipn-eval prediction --push-net builtin --scenes 500 --no-segmented

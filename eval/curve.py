@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from dipn_jax import checkpoint
+from dipn_jax import checkpoint, files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DIPN
 from eval.prediction import DISTANCES
@@ -31,12 +31,16 @@ def load(runs: Sequence[pathlib.Path]) -> dict[str, DIPN]:
     """The networks of `dipn-train push` runs by `PUSHES/SEED`, in order.
 
     Raises:
-      UserError: a folder holds no such run, or two are of the same pushes and seed.
+      UserError: a folder holds no such run, one that has not ended, or two are of the same pushes and seed.
     """
     found: dict[tuple[int, int], DIPN] = {}
     for run in runs:
         network = checkpoint.load_network(run, network="dipn")
         meta = checkpoint.newest(run)[1]  # type: ignore[index]
+        plan = run / "config.json"
+        planned = files.read_json(plan).get("steps", 0) if plan.exists() else 0
+        if planned > meta["step"]:
+            raise UserError(f"--curve {run}: stopped at step {meta['step']} of {planned}; let its command end first")
         if "examples" not in meta:
             raise UserError(f"--curve {run}: its checkpoint does not say how many pushes it is of; train again")
         key = (int(meta["examples"]), int(meta["seed"]))

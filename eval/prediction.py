@@ -26,12 +26,15 @@ from dipn_jax import (
     shapes,
     structs,
 )
+from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DIPN
 from dipn_jax.physics import Engine
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.structs import Fault, Observation, Push, Scene, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
 
+MAX_ATTEMPTS = 100
+"""Batches without a usable push before giving up."""
 DISTANCES = (5, 10)
 """Centimetres at which errors are reported."""
 FILMS = 6
@@ -79,6 +82,7 @@ def evaluate(
     films: list[dict[str, np.ndarray]] = []
     done, batch, rows, films = partial.load((0, 0, rows, films))
     with console.Progress("prediction", scenes, unit="pushes", done=done) as progress:
+        empty = 0
         while done < scenes:
             drop, aim = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch))
             items = clutter.settled_exactly(drop, engine, config, min(clutter.BATCH, scenes - done))
@@ -93,6 +97,9 @@ def evaluate(
                     measure(rows, "_segmented", predictors, found, seen, pushes, truth, after, rolled)
                 for i in range(min(FILMS - len(films), len(pushes.angle))):
                     films.append(_film(items, pushes, seen, first, truth, i))
+            empty = 0 if len(pushes.angle) else empty + 1
+            if empty == MAX_ATTEMPTS:
+                raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; loosen the scenes")
             progress.advance(len(pushes.angle))
             done, batch = done + len(pushes.angle), batch + 1
             partial.save((done, batch, rows, films))

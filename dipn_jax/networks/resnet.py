@@ -15,7 +15,7 @@ SMALL = 4
 
 
 class Conv(nnx.Conv):
-    """`nnx.Conv` in the form that XLA differentiates fastest on a CPU; the same function and parameters.
+    """`nnx.Conv` padded to keep the resolution, in the form that XLA differentiates fastest on a CPU.
 
     Measured forward and backward on two cores: a 1x1 as a matrix product is 1.5 to 6 times as fast, a 3x3 of 512
     channels on 56 maps of 2x2 pixels 70 times, an 11x57 of one channel 10 times.

@@ -129,6 +129,27 @@ def test_batch_elements_do_not_interact(forward: Any, inputs: PushInput) -> None
     np.testing.assert_allclose(forward(changed)[1:], forward(inputs)[1:], atol=1e-5)
 
 
+def test_the_published_form_is_as_blind_to_order_padding_and_neighbours(settled: Any) -> None:
+    network = dipn.DIPN(dipn.DipnConfig(preset="paper", stages=(1, 1, 1, 1)), rngs=nnx.Rngs(0))
+    network.eval()
+    graph, state = nnx.split(network)
+    forward = jax.jit(lambda seen: nnx.merge(graph, state)(seen, jnp.full((2, 1), 0.05)))
+    two = structs.take(settled.scene, slice(0, 2))
+    heights, labels = jax.vmap(render.render_depth)(two, jnp.asarray(settled.poses[:2]))
+    pushes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, *leaf.shape)), _push())
+    seen = push_frame.push_inputs(labels, heights, pushes, slots=SLOTS, view=PAPER)[0]
+    there = forward(seen)
+    assert np.abs(there).max() > 1e-3
+    order = np.array([3, 1, 4, 0, 2])
+    each = ("crops", "outlines", "centers", "present")
+    mixed = seen.replace(**{name: getattr(seen, name)[:, order] for name in each})
+    np.testing.assert_allclose(forward(mixed), there[:, order], atol=1e-4)
+    wide = push_frame.push_inputs(labels, heights, pushes, slots=SLOTS + 2, view=PAPER)[0]
+    np.testing.assert_allclose(forward(wide)[:, :SLOTS], there, atol=1e-4)
+    changed = jax.tree.map(lambda leaf: leaf.at[0].set(jnp.zeros_like(leaf[0])), seen)
+    np.testing.assert_allclose(forward(changed)[1], there[1], atol=1e-5)
+
+
 @pytest.mark.parametrize("view", [PAPER, COMPACT])
 def test_the_mirror_of_an_input_is_the_input_of_the_mirror(view: push_frame.View, settled: Any) -> None:
     # a push along +x through the middle of the map: mirroring the scene is flipping the map's rows
