@@ -60,20 +60,23 @@ def episodes(work: Work) -> tuple[np.ndarray, np.ndarray]:
     """
     import pybullet
 
-    client = pybullet.connect(pybullet.DIRECT)
+    client, timestep = pybullet.connect(pybullet.DIRECT), work.settings.timestep
     ends, depths = [], []
     for index in range(len(work.poses)):
         bodies, hand, held = _world(pybullet, client, work, index)
         look = functools.partial(_depths, bodies=bodies) if work.watch else _nothing
-        depths += _steps(pybullet, client, work.settings, work.settle_time, look)
+        depths += _steps(pybullet, client, round(work.settle_time / timestep), look)
         path = work.paths[index].copy()
         aimed = bodies[work.aimed[index]]
         path[:, :2] += pybullet.getBasePositionAndOrientation(aimed, physicsClientId=client)[0][:2]
         pybullet.resetBasePositionAndOrientation(hand, *_placed(pybullet, path[0]), physicsClientId=client)
-        for target in path:
+        done = 0
+        for tick, target in enumerate(path, 1):
             place, turn = _placed(pybullet, target)
             pybullet.changeConstraint(held, place, turn, maxForce=GRIPPER_FORCE, physicsClientId=client)
-            _steps(pybullet, client, work.settings, CONTROL_PERIOD)
+            due = round(tick * CONTROL_PERIOD / timestep)  # no whole number of steps fits a period
+            _steps(pybullet, client, due - done)
+            done = due
         found = [pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0] for body in bodies]
         ends.append(np.array(found))
     pybullet.disconnect(client)
@@ -89,12 +92,10 @@ def _nothing(bullet: Any, client: int) -> np.ndarray:
     return np.zeros(0)
 
 
-def _steps(
-    bullet: Any, client: int, settings: Settings, duration: float, look: Callable[..., np.ndarray] = _nothing
-) -> list[np.ndarray]:
-    """Step for `duration` seconds; what `look` sees after each step."""
+def _steps(bullet: Any, client: int, count: int, look: Callable[..., np.ndarray] = _nothing) -> list[np.ndarray]:
+    """Step `count` times; what `look` sees after each step."""
     seen = []
-    for _ in range(round(duration / settings.timestep)):
+    for _ in range(count):
         bullet.stepSimulation(physicsClientId=client)
         seen.append(look(bullet, client))
     return seen

@@ -115,19 +115,26 @@ def share_held(engine: Engine, rng: np.random.Generator, item: shapes.Item, trie
     return float(np.asarray(outcome.success)[sound].mean()), int(sound.sum())
 
 
-def share_of_wrong_held(engine: Engine, rng: np.random.Generator, tries: int) -> tuple[float, float]:
-    """Shares of grasps that hold though they must not: closing on the 100 mm side, and with a finger on top.
+HEAVY = 2.0
+"""Kilograms: an object that a finger on top of it cannot press aside, and that can still be lifted."""
 
-    The object under the finger weighs 20 kg: it does not give way.
+
+def shares_of_long(engine: Engine, rng: np.random.Generator, tries: int) -> dict[str, float]:
+    """Shares of grasps of a 100 mm cuboid that hold: closing on the 100 mm side (`too_wide`), with a finger on top of
+    one that weighs HEAVY (`on_top`), and centred on the same one (`heavy`), which only shows that it can be lifted.
     """
     item = next(item for item in shapes.CATALOGUE if item.name == "cuboid_long")
     scene, poses = alone(rng, item, tries)
     poses[:, 0, 2] -= 0.002
     poses[:, 0, 3:] = np.asarray(geometry.quat_about_z(np.linspace(0, 3, tries)))
     along = Grasp(poses[:, 0, :2], np.linspace(0, 3, tries), np.full(tries, 0.02))
-    heavy = scene.replace(mass=np.full_like(scene.mass, 20.0))
+    heavy = scene.replace(mass=np.full_like(scene.mass, HEAVY))
     axis = np.stack([-np.sin(along.angle), np.cos(along.angle)], -1)
     beside = along.replace(center=along.center + 0.045 * axis, angle=along.angle + np.pi / 2)
-    _, wide = primitives.grasp(engine, scene, poses, structs.cast(along))
-    _, on_top = primitives.grasp(engine, heavy, poses, structs.cast(beside))
-    return float(np.asarray(wide.success).mean()), float(np.asarray(on_top.success).mean())
+    middle = along.replace(angle=along.angle + np.pi / 2)
+    tried = {"too_wide": (scene, along), "on_top": (heavy, beside), "heavy": (heavy, middle)}
+    shares = {}
+    for name, (objects, grasps) in tried.items():
+        _, outcome = primitives.grasp(engine, objects, poses, structs.cast(grasps))
+        shares[name] = float(np.asarray(outcome.success).mean())
+    return shares

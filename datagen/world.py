@@ -85,9 +85,8 @@ def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
             engine, np.random.default_rng(seed), item, tries
         )
         found[f"grasp_isolated_tries/{item.name}"] = count
-    found["grasp_too_wide/held"], found["grasp_on_top/held"] = isolated.share_of_wrong_held(
-        engine, np.random.default_rng(seed), tries
-    )
+    for name, share in isolated.shares_of_long(engine, np.random.default_rng(seed), tries).items():
+        found[f"grasp_{name}/held"] = share
     return found
 
 

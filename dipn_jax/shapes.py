@@ -186,8 +186,8 @@ def hull(shape: Array, size: Array) -> Hull:
     ring = vertices[:, :CORNERS]
     edge = jnp.roll(ring, -1, axis=1) - ring
     normal = jnp.cross(edge, axis)
-    length = jnp.linalg.norm(normal, axis=-1, keepdims=True)
-    normal = normal / jnp.where(length > 0, length, 1.0)
+    square = (normal**2).sum(-1, keepdims=True)
+    normal = normal / jnp.sqrt(jnp.where(square > 0, square, 1.0))  # of no length where corners are doubled
     sides = jnp.asarray(SIDES)[index]
     normal = jnp.take_along_axis(normal, sides[..., None], axis=1)
     corner = jnp.take_along_axis(ring, sides[..., None], axis=1)

@@ -93,13 +93,13 @@ GOALS = [
     ("1,500 pushes, XOR / 2 true, all objects", "push_error_paper_measure/curve/1500/{}/all/mean", False, (0.06, 0.10)),
     ("51,000 pushes, 1 - IoU, all objects", "push_error/curve/51000/{}/all/mean", False, (0.05, 0.08)),
     (
-        "1,500 pushes, 1 - IoU over the better baseline's, moved",
+        "1,500 pushes, 1 - IoU over a baseline's, moved",
         "push_error/curve/1500/{}/moved/mean",
         True,
         (0.35, 0.40),
     ),
     (
-        "51,000 pushes, 1 - IoU over the better baseline's, moved",
+        "51,000 pushes, 1 - IoU over a baseline's, moved",
         "push_error/curve/51000/{}/moved/mean",
         True,
         (0.35, 0.40),

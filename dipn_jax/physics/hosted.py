@@ -66,7 +66,7 @@ def follow(
             if fence:
                 hold_in(sims, mass, up=time < fence)
             watch.raised(*sims.advance())
-            watch.tick()
+            watch.tick(controls(trajectories, time + physics.CONTROL_PERIOD))
     fault = watch.codes(controls(trajectories, float(samples[-1])), settle)
     rollout, hand = (np.stack(part, 1).astype(np.float32) for part in zip(*stored, strict=True))
     return Rollout(rollout, hand, fault)
@@ -78,7 +78,7 @@ class Watch:
     def __init__(self, scenes: Scene, sims: Worlds) -> None:
         self.scenes, self.sims = scenes, sims
         self.broken, self.full = np.zeros((2, len(scenes.shape)), bool)
-        self.top = np.zeros(len(scenes.shape))
+        self.top, self.stray = np.zeros((2, len(scenes.shape)))
 
     def raised(self, failed: np.ndarray, full: np.ndarray) -> None:
         """Note simulations that the engine gave up."""
@@ -88,11 +88,14 @@ class Watch:
         """Of the objects `[B, N, 6]`."""
         return np.array(self.sims.qvel[:, GRIPPER_DOF:]).reshape(*self.scenes.shape.shape, 6)
 
-    def tick(self) -> None:
+    def tick(self, target: np.ndarray) -> None:
+        """Note speeds, and how far the hand is off its `target [B, 6]`."""
         linear = faults.speed(self.scenes, self.velocity(), xp=np)
         finite = np.isfinite(linear).all(-1)
         self.broken |= ~finite
         self.top = np.maximum(self.top, np.where(finite, linear.max(-1), 0.0))
+        off = faults.off_path(np.array(self.sims.qpos[:, :3]), target[:, :3], xp=np)
+        self.stray = np.maximum(self.stray, np.where(np.isfinite(off), off, np.inf))
 
     def codes(self, target: np.ndarray, settle: bool) -> np.ndarray:
         """Fault codes `[B]` at the end of a rollout."""
@@ -105,6 +108,7 @@ class Watch:
             qpos[:, :3],
             target[:, :3],
             top=self.top,
+            stray=self.stray,
             broken=self.broken | (warning[:, _BAD] > 0).any(-1),
             full=self.full | (warning[:, _FULL] > 0).any(-1),
             depth=np.where(self.broken, 0.0, self.sims.depths()),

@@ -176,7 +176,7 @@ class _Program:
         mass = jnp.where(present, scenes.mass, 0.0)
         target = functools.partial(recording.control, trajectories)
         state = jax.vmap(self._initial)(start, target(0.0))
-        record = Record(*room, jnp.zeros(len(poses)), jnp.zeros(len(poses), bool))
+        record = Record(*room, jnp.zeros(len(poses)), jnp.zeros(len(poses)), jnp.zeros(len(poses), bool))
 
         def body(tick: jax.Array, carry: tuple[State, Record]) -> tuple[State, Record]:
             state, record = carry
@@ -184,7 +184,7 @@ class _Program:
             ctrl = target(tick * physics.CONTROL_PERIOD + GRIPPER.lag)
             force = jnp.where(tick * physics.CONTROL_PERIOD < fence, recording.hold_in(mass, state), 0.0)
             state = jax.vmap(self._tick)(fields, state, ctrl, force)
-            return state, recording.watch(record, state, scenes)
+            return state, recording.watch(record, state, scenes, target((tick + 1) * physics.CONTROL_PERIOD))
 
         last = ticks.max()
         state, record = jax.lax.fori_loop(0, last, body, (state, record))
@@ -197,6 +197,7 @@ class _Program:
             state.qpos[:, :3],
             end[:, :3],
             top=record.top,
+            stray=record.stray,
             broken=record.broken,
             full=state.full,
             depth=state.depth,

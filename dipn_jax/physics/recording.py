@@ -30,6 +30,7 @@ class Record(Pytree):
     poses: Array  # [S, N, 7]
     gripper: Array  # [S, 5]
     top: Array  # [] m/s: highest speed of a present object
+    stray: Array  # [] metres: farthest that the hand was off its path
     broken: Array  # [] bool
 
 
@@ -70,9 +71,11 @@ def velocity(state: State, scenes: Scene) -> jax.Array:
     return state.qvel[:, GRIPPER_DOF:].reshape(*scenes.shape.shape, 6)
 
 
-def watch(record: Record, state: State, scenes: Scene) -> Record:
-    """Note speeds, and whether everything is finite."""
+def watch(record: Record, state: State, scenes: Scene, target: jax.Array) -> Record:
+    """Note speeds, whether everything is finite, and how far the hand is off its `target [B, 6]`."""
     linear = faults.speed(scenes, velocity(state, scenes))
     finite = jnp.isfinite(state.qpos).all(-1) & jnp.isfinite(state.qvel).all(-1)
     top = jnp.maximum(record.top, jnp.where(finite, linear.max(-1), 0.0))
-    return record.replace(top=top, broken=record.broken | ~finite)
+    off = faults.off_path(state.qpos[:, :3], target[:, :3])
+    stray = jnp.maximum(record.stray, jnp.where(finite, off, jnp.inf))
+    return record.replace(top=top, stray=stray, broken=record.broken | ~finite)

@@ -36,14 +36,17 @@ def test_a_view_of_turned_poses_is_the_turned_view(settled: Any) -> None:
     assert both.sum() / either.sum() > 0.95  # half a pixel of sampling all around objects of some 30 pixels
 
 
-def test_gradient_of_height_is_finite(settled: Any) -> None:
-    scene, poses = jax.tree.map(lambda leaf: leaf[0, :1], settled.scene), jnp.asarray(settled.poses[0, :1])
+def test_gradients_of_height_are_finite(settled: Any) -> None:
+    scene, poses = structs.take(settled.scene, 0), jnp.asarray(settled.poses[0])
+    scene = scene.replace(shape=np.where(np.arange(len(scene.shape)) == 1, ABSENT, scene.shape))
 
-    def mean_height(z: jax.Array) -> jax.Array:
-        return render.render_depth(scene, poses.at[:, 2].add(z))[0].mean()
+    def mean_height(size: jax.Array, poses: jax.Array) -> jax.Array:
+        return render.render_depth(scene.replace(size=size), poses)[0].mean()
 
-    gradient = jax.jacfwd(mean_height)(jnp.float32(0.0))
-    assert np.isfinite(gradient) and gradient > 0
+    by_size, by_pose = jax.grad(mean_height, (0, 1))(jnp.asarray(scene.size), poses)
+    assert np.isfinite(by_size).all() and np.isfinite(by_pose).all()
+    assert (np.asarray(by_size).sum(-1) > 0).sum() >= 3 and (by_size[1] == 0).all()  # a hidden object has none
+    assert (by_pose[:, 2] > 0).sum() >= 3
 
 
 def test_colors_follow_labels(settled: Any) -> None:
