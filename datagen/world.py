@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from datagen import episodes, isolated
-from dipn_jax import clutter, geometry, model, primitives, render, scenes, shapes, structs
+from dipn_jax import clutter, model, primitives, render, scenes, shapes, structs
 from dipn_jax.physics import Engine, EngineName, native
 from dipn_jax.structs import Fault, Grasp, Push, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
@@ -19,7 +19,6 @@ COUNTS = (1, 3, 7, 10, 20, 30)
 """Numbers of objects that drops are counted for."""
 MOVED = 0.001
 """Metres: what the reference moves by more during a push counts in the engines' agreement."""
-TIPPED = np.deg2rad(45)
 """Radians by which an object's own axes tilt when it tips over or rolls."""
 ENGINES: dict[str, tuple[EngineName, dict[str, float]]] = {
     "native_awake": ("native", {"sleep": 0.0}),
@@ -61,7 +60,7 @@ def drops(key: jax.Array, engine: Engine, tries: int) -> Metrics:
 def rests(name: str, engine: Engine, seed: int, sides: int) -> Metrics:
     """`rest/{engine}/...`: every catalogue item set down on `sides` sides of its bounding box.
 
-    Shares that come to rest and that stay as they were put (within TIPPED), and how far from the table, at most, the
+    Shares that come to rest and that stay as they were put (within 45 degrees), and how far from the table at most the
     lowest corner of one at rest is.
     """
     made = [isolated.alone(np.random.default_rng(seed), item, sides) for item in shapes.CATALOGUE]
@@ -71,7 +70,7 @@ def rests(name: str, engine: Engine, seed: int, sides: int) -> Metrics:
     gap = 1000 * np.abs(shapes.lowest_corner(scene.shape, scene.size, after, xp=np))[fault == 0]
     return {
         f"rest/{name}/at_rest": float((fault == 0).mean()),
-        f"rest/{name}/as_put": float((_turn(after[..., 3:], poses[..., 3:]) < TIPPED).mean()),
+        f"rest/{name}/as_put": float((_turn(after[..., 3:], poses[..., 3:]) < primitives.TIPPED).mean()),
         f"rest/{name}/from_table_max_mm": float(gap.max()),
         f"rest/{name}/tries": len(fault),
     }
@@ -112,8 +111,7 @@ def pushes(engine: Engine, made: Trial) -> tuple[Metrics, np.ndarray]:
     rollout = primitives.push(engine, made.items.scene, made.items.poses, made.pushes)
     poses, fault = np.asarray(rollout.poses), np.asarray(rollout.fault)
     moved = np.linalg.norm(poses[:, -1, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED
-    up = [np.asarray(geometry.quat_to_matrix(jnp.asarray(poses[:, k, :, 3:])))[..., 2, :] for k in (0, -1)]
-    tipped = np.arccos(np.clip((up[0] * up[1]).sum(-1), -1, 1)) > TIPPED
+    tipped = np.asarray(primitives.tipped(poses[:, 0, :, 3:], poses[:, -1, :, 3:]))
     deep = [_depths(made, poses[:, k], np.asarray(rollout.gripper)[:, k]).max() for k in range(PUSH_STEPS + 1)]
     found = {
         "push/tipped_of_moved": float(tipped[moved].mean()),

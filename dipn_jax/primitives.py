@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dipn_jax import geometry
 from dipn_jax.physics import Engine
-from dipn_jax.structs import Array, Grasp, Outcome, Push, Rollout, Scene, Trajectory
+from dipn_jax.structs import Array, Fault, Grasp, Outcome, Push, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS
 
 CLEAR = 0.30  # metres: height at which the gripper touches nothing
@@ -25,6 +26,7 @@ CLOSE_SPEED = 0.15  # m/s, each finger; a step instead of a ramp throws objects
 HOLD_TIME = 0.15
 LIFT_TIME = 0.5
 REST_TIME = 0.3
+TIPPED = np.deg2rad(45)
 HELD_RISE = 0.5  # of the lift: an object that rose by more is held
 
 
@@ -96,7 +98,15 @@ def settle(
 
 def push(engine: Engine, scenes: Scene, poses: Array, pushes: Push) -> Rollout:
     """Execute one push of at most 10 cm a scene; `poses [B, 12, N, 7]`: at each centimetre and at rest."""
-    return engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(), settle=True)
+    rollout = engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(), settle=True)
+    over = tipped(rollout.poses[..., 0, :, 3:], rollout.poses[..., -1, :, 3:]) & (scenes.shape >= 0)
+    return rollout.replace(fault=rollout.fault | jnp.where(over.any(-1), Fault.TIPPED, 0))
+
+
+def tipped(before: Array, after: Array) -> jax.Array:
+    """Which objects with quaternions `[..., 4]` (wxyz) have another side up, by over 45 degrees."""
+    up = [geometry.quat_to_matrix(jnp.asarray(quat))[..., 2, :] for quat in (before, after)]
+    return (up[0] * up[1]).sum(-1) < np.cos(TIPPED)
 
 
 def grasp(engine: Engine, scenes: Scene, poses: Array, grasps: Grasp) -> tuple[Rollout, Outcome]:

@@ -27,8 +27,9 @@ def _bounds(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     """Affine bounds on z `[N, P, F, 3]` (constant, x, y), which of them are from above, and which parts there are."""
     hulls = jax.vmap(shapes.hull)(scene.shape, scene.size)
     rotation = geometry.quat_to_matrix(poses[:, 3:])
-    normal = jnp.einsum("nij,npfj->npfi", rotation, hulls.normals)
-    offset = hulls.offsets + jnp.einsum("npfi,ni->npf", normal, poses[:, :3])
+    with jax.default_matmul_precision("highest"):  # tenths of millimetres, which accelerators else round away
+        normal = jnp.einsum("nij,npfj->npfi", rotation, hulls.normals)
+        offset = hulls.offsets + jnp.einsum("npfi,ni->npf", normal, poses[:, :3])
     nz = jnp.where(jnp.abs(normal[..., 2]) < _STEEP, _STEEP, normal[..., 2])
     plane = jnp.stack([offset / nz, -normal[..., 0] / nz, -normal[..., 1] / nz], -1)
     return plane, nz > 0, hulls.alive

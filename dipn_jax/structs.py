@@ -32,7 +32,8 @@ class Fault:
     OUTSIDE = 8  # an object's centre is outside the workspace
     SPEED = 16  # an object moved faster than anything dropped or pushed should
     PENETRATION = 32  # an object is in the table, or in another
-    SHORT = 64  # the gripper did not reach its commanded pose
+    SHORT = 64  # the gripper did not reach its commanded pose, or left its path on the way
+    TIPPED = 128  # a push tipped an object over
 
     UNUSABLE = NON_FINITE | CAPACITY | SPEED | PENETRATION
     """The simulation went wrong; the other faults are physics (a roll, an object off the table) or the gripper's."""
@@ -45,6 +46,7 @@ class Fault:
         16: "speed",
         32: "penetration",
         64: "gripper_short",
+        128: "tipped",
     }
 
     @classmethod

@@ -22,6 +22,7 @@ from mujoco.mjx._src import collision_driver
 from mujoco.mjx._src.types import GeomType
 
 from dipn_jax import model, physics, shapes
+from dipn_jax.errors import UserError
 from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
 from dipn_jax.physics import cone, faults, prisms, recording
 from dipn_jax.physics.recording import Record, State
@@ -57,7 +58,7 @@ class MjxEngine:
           devices: share every chunk; all local ones if not given. A power of two of them are used.
 
         Raises:
-          UserError: the control period is not a whole number of time steps.
+          UserError: the control period is not a whole number of time steps, or `chunk` is no power of two.
         """
         self.substeps = physics.substeps(config)
         prisms.register()
@@ -65,6 +66,8 @@ class MjxEngine:
         self.config = config
         local = list(devices or jax.local_devices())
         self.devices = local[: 1 << (len(local).bit_length() - 1)]
+        if chunk and chunk & (chunk - 1):
+            raise UserError(f"mjx: chunk {chunk}; want a power of two")
         on_cpu = self.devices[0].platform == "cpu"
         self.chunk, self.batch = chunk or (16 if on_cpu else 1024), 64 if on_cpu else 1024
         self.programs: dict[int, Callable[..., Rollout]] = {}  # by number of slots
@@ -87,15 +90,17 @@ class MjxEngine:
         batch, slots = args[0].shape.shape
         # powers of two, so that batches of many sizes share few programs
         size = max(min(1 << (batch - 1).bit_length(), self.chunk), len(self.devices))
-        done = []
-        with self._lock, jax.numpy_rank_promotion("allow"):  # MJX relies on it
+        done: list[Rollout] = []
+        # MJX relies on rank promotion; contacts need whole float32 products, which accelerators else shorten
+        with self._lock, jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):
             for start in range(0, batch, size):
                 rows = np.minimum(np.arange(start, start + size), batch - 1)
                 part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)
                 if self._stopped.is_set():
                     raise physics.Stopped
                 room = _room(size, len(padded), slots)
-                done.append(self._program(slots)(*part, room, padded, np.bool_(settle), np.float32(fence)))
+                fresh = self._program(slots)(*part, room, padded, np.bool_(settle), np.float32(fence))
+                done = [*done[:-1], *jax.device_get(done[-1:]), fresh]  # fetched while the next one runs
         out = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(x) for x in leaves])[:batch], *done)
         return Rollout(out.poses[:, : len(ticks)], out.gripper[:, : len(ticks)], out.fault)
 

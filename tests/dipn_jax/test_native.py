@@ -203,6 +203,16 @@ def test_a_gripper_that_is_stopped_says_so(engine: Any, resting: Any) -> None:
     assert not (free.fault & Fault.SHORT).any()
 
 
+def test_an_object_that_is_pushed_over_is_flagged(engine: Any) -> None:
+    size = np.tile(np.array([0.025, 0.05, 0.1], np.float32), (2, 1, 1))  # upright, one side narrow
+    friction = np.array([[2.0], [0.05]], np.float32)  # one sticks to the table, one slides
+    scene = Scene(np.zeros((2, 1), np.int32), size, np.zeros_like(size), np.full((2, 1), 0.06, np.float32), friction)
+    poses = np.zeros((2, 1, 7), np.float32)
+    poses[..., 2], poses[..., 3] = 0.05, 1
+    rollout = primitives.push(engine, scene, poses, _pushes(2))
+    np.testing.assert_array_equal(np.asarray(rollout.fault & Fault.TIPPED) > 0, [True, False])
+
+
 def test_empty_slots_keep_their_pose(engine: Any, resting: Any) -> None:
     scene, poses = resting
     rollout = primitives.settle(engine, scene, poses, duration=0.1)
