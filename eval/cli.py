@@ -256,10 +256,12 @@ def report(
     console.say(f"{out / 'report.html'}: {len(values)} numbers, also in {out / 'metrics.json'}")
 
 
+COMMANDS = {"prediction": predict, "grasp": grasp, "clear": clear, "report": report}
+
+
 def main() -> None:
     """Entry point."""
-    commands = {"prediction": predict, "grasp": grasp, "clear": clear, "report": report}
-    sys.exit(console.run("Measure predictors, grasps and whole policies; write the report.", commands))
+    sys.exit(console.run("Measure predictors, grasps and whole policies; write the report.", COMMANDS))
 
 
 if __name__ == "__main__":

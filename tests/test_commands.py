@@ -12,16 +12,7 @@ from dipn_jax.networks.grasp import GraspConfig
 from eval import cli as eval_cli
 from train import cli as train_cli
 
-COMMANDS = {
-    "datagen": datagen_cli.COMMANDS,
-    "train": {"push": train_cli.push, "grasp-pretrain": train_cli.grasp_pretrain, "grasp": train_cli.grasp},
-    "eval": {
-        "prediction": eval_cli.predict,
-        "grasp": eval_cli.grasp,
-        "clear": eval_cli.clear,
-        "report": eval_cli.report,
-    },
-}
+COMMANDS = {"datagen": datagen_cli.COMMANDS, "train": train_cli.COMMANDS, "eval": eval_cli.COMMANDS}
 
 
 @pytest.fixture
@@ -53,6 +44,16 @@ def test_ranges_and_distances_that_contradict_themselves(call, tmp_path: pathlib
     _one_line(call(*out, "--distances", 0.1, 0.1), "none twice")
     _one_line(call("datagen", "check-world", "--out", tmp_path / "d", "--engines", "bullet"), "--engines bullet")
     assert not (tmp_path / "d").exists()
+
+
+def test_grasps_that_contradict_themselves(call, tmp_path: pathlib.Path) -> None:
+    guided = ("datagen", "grasp", "--grasp-net", tmp_path, "--out", tmp_path / "d")
+    _one_line(call(*guided, "--guided", 0.8, "--hard", 0.5), "--guided 0.8 --hard 0.5")
+    _one_line(call(*guided), "no whole step under checkpoints/")
+    _one_line(call("train", "grasp-online", "--out", tmp_path / "r", "--tables", 0), "--tables 0")
+    _one_line(call("eval", "grasp", "--out", tmp_path / "e"), "give --grasp-net or --curve")
+    _one_line(call("eval", "grasp", "--curve", tmp_path, "--out", tmp_path / "e"), "config.json")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_folder(call, tmp_path: pathlib.Path) -> None:

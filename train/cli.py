@@ -212,16 +212,18 @@ def export(
     console.say(f"{out}: {network}")
 
 
+COMMANDS = {
+    "push": push,
+    "grasp-pretrain": grasp_pretrain,
+    "grasp": grasp,
+    "grasp-online": grasp_online,
+    "export": export,
+}
+
+
 def main() -> None:
     """Entry point."""
-    commands = {
-        "push": push,
-        "grasp-pretrain": grasp_pretrain,
-        "grasp": grasp,
-        "grasp-online": grasp_online,
-        "export": export,
-    }
-    sys.exit(console.run("Train the push and grasp networks; every run can be interrupted and resumed.", commands))
+    sys.exit(console.run("Train the push and grasp networks; every run can be interrupted and resumed.", COMMANDS))
 
 
 if __name__ == "__main__":
