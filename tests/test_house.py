@@ -131,7 +131,8 @@ def test_the_wheel_holds_all_four_packages_and_the_data(tmp_path: pathlib.Path) 
     script = (
         "import dipn_jax.scenes, datagen.cli, train.cli, eval.cli, pathlib; "
         "assert len(dipn_jax.scenes.load_cases(dipn_jax.scenes.hard_cases_path())[0]) == 10; "
-        "import dipn_jax.checkpoint as c; c.load_network(pathlib.Path('builtin'), network='dipn'); "
+        "import dipn_jax.checkpoint as c; "
+        "[c.load_network(pathlib.Path('builtin'), network=name) for name in ('dipn', 'grasp')]; "
         "assert pathlib.Path(dipn_jax.__file__).is_relative_to(pathlib.Path.cwd() / 'site'), dipn_jax.__file__"
     )
     environment = {"PYTHONPATH": str(site), "PATH": "", "HOME": str(tmp_path)}

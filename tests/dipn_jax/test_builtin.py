@@ -1,0 +1,50 @@
+"""The networks that come with the package."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from dipn_jax import candidates, checkpoint, clutter, geometry, policy, primitives, render, structs
+
+
+def test_the_builtin_push_network_knows_what_a_push_does(settled: Any, engine: Any) -> None:
+    """On three scenes of five objects, against the engine: far better than to say that nothing moves."""
+    scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]
+    seen = clutter.observe(scene, poses)
+    sample = jax.vmap(lambda key, one: candidates.sample_pushes(key, one, count=1, slots=5, distance=0.1))
+    pushes, feasible = sample(jax.random.split(jax.random.key(0), 3), seen)
+    pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], pushes)
+    assert feasible.all()
+    network: Any = checkpoint.load_network(pathlib.Path("builtin"), network="dipn")
+    distances = np.tile(np.array([0.05, 0.1], np.float32), (3, 1))
+    told = policy.dipn_motions(network, seen, pushes, distances, slots=5)
+    rolled = np.asarray(primitives.push(engine, scene, poses, pushes).poses)
+    centers = jax.vmap(lambda label: candidates.mask_centers(label, 5)[0])(seen.label)
+    true = geometry.planar_motion(rolled[:, :1], rolled[:, [5, 10]], centers[:, None])
+    moved = np.linalg.norm(true[..., :2], axis=-1) > 0.01
+    error = np.linalg.norm((told - true)[..., :2], axis=-1)
+    assert moved.sum() >= 4
+    assert error[moved].mean() < 0.25 * np.linalg.norm(true[..., :2], axis=-1)[moved].mean()
+
+
+def test_the_builtin_grasp_network_grasps(settled: Any, engine: Any) -> None:
+    scorer = policy.load_scorer(pathlib.Path("builtin"))
+    seen = jax.tree.map(np.asarray, clutter.observe(settled.scene, settled.poses))
+    images = jax.vmap(render.rgbd)(seen)
+    scores = jax.jit(scorer)(images)
+    taken = [candidates.grasp_at(candidates.best_grasp(scores[i])[0], seen.height[i]) for i in range(len(images))]
+    _, outcome = primitives.grasp(engine, settled.scene, settled.poses, structs.stack(taken))
+    assert np.asarray(outcome.success).sum() >= len(images) - 1
+
+
+@pytest.mark.parametrize("network", ["dipn", "grasp"])
+def test_a_builtin_network_is_small_and_names_no_folder_of_the_machine_that_made_it(network: str) -> None:
+    folder = checkpoint.find(pathlib.Path("builtin"), network=network)
+    stored = [path for path in folder.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in stored) < 3e6
+    assert not [path for path in stored if path.suffix == ".txt" and b" /" in path.read_bytes()]
