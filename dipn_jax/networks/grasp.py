@@ -194,8 +194,9 @@ def geometric_labels(height: jax.Array) -> jax.Array:
     def highest(low: int, high: int, half_rows: int) -> jax.Array:
         rows, cols = 2 * half_rows + 1, high - low + 1
         pad = ((half_rows, half_rows), (-low if low < 0 else 0, high if high > 0 else 0))
-        shifted = jnp.pad(height, pad)
-        top = jax.lax.reduce_window(shifted, -jnp.inf, jax.lax.max, (rows, cols), (1, 1), "VALID")
+        top = jnp.pad(height, pad)
+        for window in ((rows, 1), (1, cols)):  # a maximum over a rectangle is one of rows, then one of columns
+            top = jax.lax.reduce_window(top, -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
         begin = low if low > 0 else 0
         return top[:, begin : begin + height.shape[1]]
 
