@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-SMALL = 4
+SMALL = 2
 """Pixels a side of a map up to which a convolution is written as one matrix product."""
 
 
