@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import pathlib
+import zipfile
+import zlib
 from typing import Any
 
 import numpy as np
 
-from dipn_jax import candidates, imagine, render
+from dipn_jax import candidates, files, imagine, render
 from dipn_jax.errors import UserError
 from dipn_jax.structs import Scene
 from eval.instances import Instance
@@ -49,8 +52,9 @@ def save(path: pathlib.Path, instance: Instance) -> None:
     steps["shape"] = np.concatenate([steps["shape"], instance.scene.shape[None]])
     steps["poses"] = np.concatenate([steps["poses"], instance.poses[None]])
     scene = {key: getattr(instance.scene, key) for key in ("size", "color", "mass", "friction")}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, what=np.array(instance.did), **steps, **scene)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, what=np.array(instance.did), **steps, **scene)
+    files.write_atomically(path, stream.getvalue())
 
 
 def load(path: pathlib.Path) -> Film:
@@ -62,7 +66,7 @@ def load(path: pathlib.Path) -> Film:
     try:
         with np.load(path) as arrays:
             return Film(**{field.name: arrays[field.name] for field in dataclasses.fields(Film)})
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         raise UserError(
             f"{path}: missing, damaged or no film; run the dipn-eval command that writes it again"
         ) from None

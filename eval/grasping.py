@@ -136,7 +136,8 @@ def _next_best(scene: Scene, poses: jax.Array, *, scorer: Scorer, count: int) ->
     def one(args: tuple[Scene, jax.Array]) -> Grasp:
         seen = render.render(*args)
         scores = scorer(render.rgbd(seen)[None])[0]
-        return candidates.grasp_at(candidates.best_grasps(scores, count=count), seen.height)
+        best = candidates.best_grasps(scores, count=count + 1)[1:]  # without the one that missed
+        return candidates.grasp_at(best, seen.height)
 
     return jax.lax.map(one, (scene, poses))
 

@@ -15,6 +15,7 @@ import optax
 from flax import nnx
 
 from dipn_jax import candidates, checkpoint, clutter, console, files, render, resume, structs
+from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig, score_image
 from dipn_jax.physics import Engine
 from dipn_jax.scenes import SceneConfig
@@ -79,8 +80,21 @@ def learn(
 
     Returns:
       Success over all grasps and over the last ones.
+
+    Raises:
+      UserError: the network is not compact, or the folder holds another run.
     """
-    identity = {"initial_weights": checkpoint.digest(model), **dataclasses.asdict(config), "scenes": str(scenes)}
+    if network_config.preset != "compact":
+        raise UserError(
+            f"grasp-online: takes a compact network, got {network_config.preset}; that one learns from a data set, by "
+            "dipn-train grasp"
+        )
+    identity = {
+        "initial_weights": checkpoint.digest(model),
+        **dataclasses.asdict(config),
+        "scenes": str(scenes),
+        "engine": type(engine).__name__,
+    }
     files.claim(out, identity)
     ended = checkpoint.newest(out)
     if ended:
@@ -102,13 +116,14 @@ def learn(
             partial.save(state)
             _log(out, state, config)
             progress.advance(1, f"{np.mean(state.success[-RECENT:]):.2f} of the last {RECENT} held")
+    _log(out, state, config)  # again, should the last round have been cut short before it
     nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
-    extra = {"seed": config.seed, "examples": len(state.success)}
-    checkpoint.save(
-        out, len(state.success), {"model": nnx.state(model)}, network="grasp", config=network_config, extra=extra
-    )
+    result = {"success": float(np.mean(state.success)), "success_recent": float(np.mean(state.success[-RECENT:]))}
+    extra = {"seed": config.seed, "examples": len(state.success), **result}
+    parts = {"model": nnx.state(model)}
+    checkpoint.save(out, len(state.success), parts, network="grasp", config=network_config, extra=extra)
     partial.finish()
-    return {"success": float(np.mean(state.success)), "success_recent": float(np.mean(state.success[-RECENT:]))}
+    return result
 
 
 class _Outcomes:

@@ -27,7 +27,9 @@ SCALE = (0.5, 0.5, 0.5, 0.05)
 """What red, green, blue (in [0, 1]) and height (metres) are divided by."""
 BLOCK = 4
 """Pixels a side of a cell: the compact network works on cells."""
-FINGER_COLUMNS = (round(GRIPPER.stroke / 2 / WORKSPACE.pixel), round(GRIPPER.stroke / 2 / WORKSPACE.pixel) + 10)
+FINGER_COLUMNS = tuple(
+    round(off / WORKSPACE.pixel) for off in (GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness)
+)
 """Pixels from the middle of a grasp to where a finger begins and ends."""
 
 

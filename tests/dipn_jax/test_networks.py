@@ -223,6 +223,18 @@ def test_scores_by_tables_are_scores_of_turned_maps() -> None:
     np.testing.assert_array_equal(quick[8:], quick[:8])
 
 
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+def test_grasp_scores_are_deterministic_and_each_image_has_its_own(preset: str) -> None:
+    model = grasp.GraspNet(grasp.GraspConfig(preset=preset, stages=(1, 1, 1, 1)), rngs=nnx.Rngs(0))
+    model.eval()
+    graph, state = nnx.split(model)
+    answer = jax.jit(lambda images: nnx.merge(graph, state)(images))
+    images = jax.random.uniform(jax.random.key(0), (2, 64, 64, 4))
+    there = answer(images)
+    np.testing.assert_array_equal(there, answer(images))
+    np.testing.assert_allclose(answer(images.at[1].set(0.0))[0], there[0], atol=1e-5)
+
+
 def test_geometric_labels_of_a_bar() -> None:
     # a bar 50 mm wide across the closing direction can be grasped at its middle, not from its end
     height = jnp.zeros((160, 160)).at[40:120, 68:93].set(0.05)

@@ -171,7 +171,7 @@ def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest
     return tables, out
 
 
-def test_every_table_ends_by_the_rules(cleared: Any) -> None:
+def test_every_table_ends_by_the_rules(cleared: Any, tmp_path: pathlib.Path) -> None:
     tables, out = cleared
     for table in tables:
         assert table.ended in ("cleared", "pushed out", "out of actions")
@@ -186,6 +186,11 @@ def test_every_table_ends_by_the_rules(cleared: Any) -> None:
     before, predicted, after = reel.pictures(len(reel.what) - 1)
     assert before.shape == predicted.shape == after.shape == (224, 224, 3)
     assert (before != after).any(), "an action leaves the table as it was"
+    cut = tmp_path / "cut.npz"
+    for content in (b"", (out / listed[0]["file"]).read_bytes()[:-300]):
+        cut.write_bytes(content)
+        with pytest.raises(UserError, match="missing, damaged or no film"):
+            film.load(cut)
 
 
 def test_the_report_is_one_file_with_its_pictures(

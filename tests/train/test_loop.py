@@ -126,6 +126,9 @@ def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pat
     assert checkpoint.digest(first) != checkpoint.digest(checkpoint.build("grasp", network))
     lines = [json.loads(line) for line in (tmp_path / "a" / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [2, 4, 6]
+    published = GraspConfig(preset="paper", stages=(1, 1, 1, 1))
+    with pytest.raises(UserError, match="takes a compact network"):
+        online.learn(checkpoint.build("grasp", published), published, engine, scene, plan, tmp_path / "c")
 
 
 def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path]) -> None:
