@@ -124,7 +124,7 @@ def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
     return jax.device_get(clutter.in_chunks(functools.partial(_windows, pixels=pixels), episodes))
 
 
-def executed_loss(model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
+def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array:
     """Cross entropy of executed grasps `[B]`: each moved by some pixels, mirrored or not, objects in new colours."""
     phase_key, flip_key, color_key = jax.random.split(key, 3)
     palette = jnp.asarray(shapes.COLORS_RGB, jnp.float32) / 255
@@ -208,7 +208,7 @@ class GraspTask:
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
         """See `loop.Task`."""
-        return executed_loss(model, batch, key)
+        return executed_loss(key, model, batch)
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss and accuracy on held-out grasps."""

@@ -131,7 +131,7 @@ class _Outcomes:
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
         """Of executed grasps."""
-        return executed_loss(model, batch, key)
+        return executed_loss(key, model, batch)
 
 
 def _begin(params: Any, optimizer: Any, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> State:
