@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from benchmarks.harness import Setting, Skipped, alternate
-from benchmarks.worker import Worker
+from benchmarks.worker import Worker, versus
 from dipn_jax import clutter, render, scenes
 from dipn_jax.networks.grasp import VIEW
 from dipn_jax.physics import make_engine
@@ -25,10 +25,6 @@ OBJECTS = 10
 def _need_torch() -> None:
     if importlib.util.find_spec("torch") is None:
         raise Skipped("PyTorch is not installed; run pip install torch (the extra `bench`)")
-
-
-def _sides(preset: str, work: str, file: pathlib.Path) -> list[Worker]:
-    return [Worker("grasp_worker", framework, preset, work, file) for framework in ("jax", "torch")]
 
 
 def _image(seed: int) -> np.ndarray:
@@ -78,14 +74,6 @@ def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
             file = pathlib.Path(name) / "examples.npz"
             success = (np.arange(batch) % 2).astype(np.float32)
             np.savez(file, images=images, pixel=np.full((batch, 2), side // 2), success=success)
-            workers = _sides(preset, "train", file)
             count = 1 if preset == "paper" else setting.pick(5, 20)
-            ours, theirs = alternate(
-                *[functools.partial(worker.steps, count) for worker in workers], repeats=setting.pick(3, 9)
-            )
-            (mine, memory), (others, their_memory) = [worker.close() for worker in workers]
-        if mine != others:
-            raise RuntimeError(f"{preset}: {mine} parameters against {others} in PyTorch: not the same network")
-        yield f"bench_grasp.vs_torch/{preset}", theirs / ours
-        yield f"bench_grasp.vs_torch/{preset}_samples_per_second", batch * count / ours
-        yield f"bench_grasp.vs_torch/{preset}_memory", memory / their_memory
+            figure, arguments = f"bench_grasp.vs_torch/{preset}", (preset, "train", file)
+            yield from versus(figure, "grasp_worker", arguments, batch=batch, count=count, repeats=setting.pick(3, 9))

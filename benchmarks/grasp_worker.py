@@ -12,50 +12,31 @@ from typing import Any
 import numpy as np
 
 from benchmarks import worker
-from benchmarks.worker import Step
+from benchmarks.worker import MOMENTUM, RATE, Step
 from dipn_jax.networks.grasp import GraspConfig
-
-RATE, MOMENTUM = 1e-3, 0.9
 
 
 def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
     """One step of SGD with momentum, or all scores of an image, in JAX; and the number of parameters."""
     import jax
     import jax.numpy as jnp
-    import optax
     from flax import nnx
 
     from dipn_jax import checkpoint, losses, policy
 
     model: Any = checkpoint.build("grasp", GraspConfig(preset=preset))
-    parameters = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
     if work == "score":
         model.eval()
+        parameters = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
         scorer, image = jax.jit(policy.grasp_scorer(model)), jnp.asarray(arrays["image"])[None]
         return lambda: scorer(image).block_until_ready(), parameters
-    model.train()
-    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    optimizer = optax.sgd(RATE, momentum=MOMENTUM)
-    state = [params, rest, optimizer.init(params)]
     images, pixel, success = (jnp.asarray(arrays[name]) for name in ("images", "pixel", "success"))
 
-    @jax.jit
-    def step(params: Any, rest: Any, moments: Any) -> Any:
-        def loss(p: Any) -> Any:
-            network = nnx.merge(graph, p, rest, copy=True)
-            logits = network(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
-            value = losses.score_loss(logits, success, jnp.ones_like(success))
-            return value, nnx.split(network, nnx.Param, ...)[2]  # type: ignore[misc]
+    def loss(network: Any) -> Any:
+        logits = network(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
+        return losses.score_loss(logits, success, jnp.ones_like(success))
 
-        (value, rest), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-        updates, moments = optimizer.update(gradient, moments, params)
-        return optax.apply_updates(params, updates), rest, moments, value
-
-    def run() -> None:
-        *state[:], value = step(*state)
-        value.block_until_ready()
-
-    return run, parameters
+    return worker.sgd(model, loss)
 
 
 def torch_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import pathlib
 import tempfile
@@ -16,7 +15,7 @@ from flax import nnx
 
 from benchmarks import push_worker
 from benchmarks.harness import Setting, Skipped, alternate, quiet
-from benchmarks.worker import Worker
+from benchmarks.worker import versus
 from datagen.generate import Job, generate
 from dipn_jax import candidates, checkpoint, clutter, policy, scenes, structs
 from dipn_jax.networks.dipn import DipnConfig
@@ -50,17 +49,9 @@ def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
             arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
             file = pathlib.Path(name) / "examples.npz"
             np.savez(file, target=np.asarray(examples.target), **arrays)  # type: ignore[arg-type]
-            workers = [Worker("push_worker", framework, preset, batch, file) for framework in ("jax", "torch")]
             count = 1 if preset == "paper" else setting.pick(10, 40)
-            ours, theirs = alternate(
-                *[functools.partial(worker.steps, count) for worker in workers], repeats=setting.pick(3, 9)
-            )
-            (mine, memory), (others, their_memory) = [worker.close() for worker in workers]
-        if mine != others:
-            raise RuntimeError(f"{preset}: {mine} parameters against {others} in PyTorch: not the same network")
-        yield f"push_net.vs_torch/{preset}", theirs / ours
-        yield f"push_net.vs_torch/{preset}_samples_per_second", batch * count / ours
-        yield f"push_net.vs_torch/{preset}_memory", memory / their_memory
+            figure, arguments = f"push_net.vs_torch/{preset}", (preset, batch, file)
+            yield from versus(figure, "push_worker", arguments, batch=batch, count=count, repeats=setting.pick(3, 9))
 
 
 def input_share(setting: Setting) -> Iterator[tuple[str, float]]:

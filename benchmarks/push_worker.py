@@ -13,51 +13,30 @@ from typing import Any
 import numpy as np
 
 from benchmarks import worker
-from benchmarks.worker import Step
+from benchmarks.worker import MOMENTUM, RATE, Step
 from dipn_jax.workspace import PUSH_STEPS
 
-RATE, MOMENTUM = 1e-3, 0.9
 FIELDS = ("push_map", "scene_map", "crops", "outlines", "centers", "present")
 
 
 def jax_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
     """One step of SGD with momentum in JAX, and the number of parameters."""
-    import jax
     import jax.numpy as jnp
-    import optax
-    from flax import nnx
 
     from dipn_jax import checkpoint, losses
     from dipn_jax.networks import dipn, push_frame
 
     inputs = push_frame.PushInput(**{name: jnp.asarray(arrays[name]) for name in FIELDS})
     model = checkpoint.build("dipn", dipn.DipnConfig(preset=preset))
-    model.train()
-    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    optimizer = optax.sgd(RATE, momentum=MOMENTUM)
-    state = [params, rest, optimizer.init(params)]
     target = _target(preset, arrays["target"])
     centimetres = np.broadcast_to(np.arange(PUSH_STEPS + 1 - target.shape[2], PUSH_STEPS + 1), target.shape[:3:2])
 
-    @jax.jit
-    def step(params: Any, rest: Any, moments: Any) -> Any:
-        def loss(p: Any) -> Any:
-            network = nnx.merge(graph, p, rest, copy=True)
-            predicted = network(inputs, jnp.asarray(centimetres) * 0.01)
-            value = losses.motion_loss(
-                predicted, jnp.asarray(target), jnp.broadcast_to(inputs.present[..., None], target.shape[:3])
-            )
-            return value, nnx.split(network, nnx.Param, ...)[2]  # type: ignore[misc]
+    def loss(network: Any) -> Any:
+        predicted = network(inputs, jnp.asarray(centimetres) * 0.01)
+        taught = jnp.broadcast_to(inputs.present[..., None], target.shape[:3])
+        return losses.motion_loss(predicted, jnp.asarray(target), taught)
 
-        (value, rest), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-        updates, moments = optimizer.update(gradient, moments, params)
-        return optax.apply_updates(params, updates), rest, moments, value
-
-    def run() -> None:
-        *state[:], value = step(*state)
-        value.block_until_ready()
-
-    return run, sum(leaf.size for leaf in jax.tree.leaves(params))
+    return worker.sgd(model, loss)
 
 
 def torch_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:

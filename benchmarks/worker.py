@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import pathlib
 import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
+from benchmarks.harness import alternate
+
+RATE, MOMENTUM = 1e-3, 0.9
 Step = Callable[[], None]
 
 
@@ -22,6 +27,34 @@ def serve(step: Step, parameters: int) -> None:
             step()
         print(time.perf_counter() - begun, flush=True)
     print(parameters, peak_memory(), flush=True)
+
+
+def sgd(model: Any, loss: Callable[[Any], Any]) -> tuple[Step, int]:
+    """A step of SGD with momentum on `loss` (of a network in flax.nnx), jitted; and the number of parameters."""
+    import jax
+    import optax
+    from flax import nnx
+
+    model.train()
+    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
+    optimizer = optax.sgd(RATE, momentum=MOMENTUM)
+    state = [params, rest, optimizer.init(params)]
+
+    @jax.jit
+    def step(params: Any, rest: Any, moments: Any) -> Any:
+        def value_of(p: Any) -> Any:
+            network = nnx.merge(graph, p, rest, copy=True)
+            return loss(network), nnx.split(network, nnx.Param, ...)[2]  # type: ignore[misc]
+
+        (value, rest), gradient = jax.value_and_grad(value_of, has_aux=True)(params)
+        updates, moments = optimizer.update(gradient, moments, params)
+        return optax.apply_updates(params, updates), rest, moments, value
+
+    def run() -> None:
+        *state[:], value = step(*state)
+        value.block_until_ready()
+
+    return run, sum(leaf.size for leaf in jax.tree.leaves(params))
 
 
 def peak_memory() -> float:
@@ -64,3 +97,21 @@ class Worker:
         if not line:
             raise RuntimeError(f"{' '.join(map(str, self.process.args))}: ended early")  # type: ignore[arg-type]
         return line
+
+
+def versus(
+    figure: str, module: str, arguments: tuple[object, ...], *, batch: int, count: int, repeats: int
+) -> Iterator[tuple[str, float]]:
+    """`FIGURE`: seconds of a training step in PyTorch over ours; samples a second, and our memory over PyTorch's.
+
+    Raises:
+      RuntimeError: the two networks have different numbers of parameters.
+    """
+    workers = [Worker(module, framework, *arguments) for framework in ("jax", "torch")]
+    ours, theirs = alternate(*[functools.partial(each.steps, count) for each in workers], repeats=repeats)
+    (mine, memory), (others, their_memory) = [each.close() for each in workers]
+    if mine != others:
+        raise RuntimeError(f"{figure}: {mine} parameters against {others} in PyTorch: not the same network")
+    yield figure, theirs / ours
+    yield f"{figure}_samples_per_second", batch * count / ours
+    yield f"{figure}_memory", memory / their_memory

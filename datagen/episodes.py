@@ -147,7 +147,7 @@ def _drop_unusable(episodes: Any, counts: dict[str, int], *, together: int = 1) 
     """Without the episodes that went wrong, and those `together` with them."""
     fault = episodes.fault
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})
-    good = ((fault & Fault.UNUSABLE) == 0).reshape(-1, together).all(-1).repeat(together)
+    good = Fault.usable(fault).reshape(-1, together).all(-1).repeat(together)
     return Batch(structs.take(episodes, good) if good.any() else None, counts)
 
 

@@ -111,7 +111,7 @@ def share_held(engine: Engine, rng: np.random.Generator, item: shapes.Item, trie
     angle = grasps.angle + rng.uniform(-TURN, TURN, len(index))
     grasps = structs.cast(grasps.replace(center=center, angle=angle))
     rollout, outcome = primitives.grasp(engine, structs.take(scene, index), poses[index], grasps)
-    sound = (np.asarray(rollout.fault) & Fault.UNUSABLE) == 0
+    sound = Fault.usable(rollout.fault)
     return float(np.asarray(outcome.success)[sound].mean()), int(sound.sum())
 
 

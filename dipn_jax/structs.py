@@ -50,6 +50,11 @@ class Fault:
     }
 
     @classmethod
+    def usable(cls, codes: Array) -> np.ndarray:
+        """Which of the simulations with `codes [...]` can be believed."""
+        return (np.asarray(codes) & cls.UNUSABLE) == 0
+
+    @classmethod
     def count(cls, codes: Array) -> dict[str, int]:
         """How many of `codes [B]` carry each named fault."""
         flat = np.asarray(codes).reshape(-1)

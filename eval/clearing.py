@@ -116,7 +116,7 @@ def _push(rows: Acting, engine: Engine) -> None:
     scene, poses = _stack(rows)
     pushes: Push = jax.tree.map(lambda *leaves: np.stack(leaves), *[decision.push for _, _, decision in rows])
     rollout = primitives.push(engine, scene, poses, pushes)
-    wrong = (np.asarray(rollout.fault) & Fault.UNUSABLE) != 0
+    wrong = ~Fault.usable(rollout.fault)
     for i, (instance, _, _) in enumerate(rows):
         instance.pushes += 1
         instance.ended = "fault" if wrong[i] else ""
@@ -129,7 +129,7 @@ def _grasp(rows: Acting, engine: Engine) -> None:
     taken = [candidates.grasp_at(decision.grasp_pixel, seen.height) for _, seen, decision in rows]
     grasps = jax.tree.map(lambda *leaves: np.stack(leaves), *taken)
     scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, grasps)
-    wrong = (fault & Fault.UNUSABLE) != 0
+    wrong = ~Fault.usable(fault)
     for i, (instance, _, _) in enumerate(rows):
         instance.grasps += 1
         instance.held += bool(held[i].any())

@@ -70,10 +70,6 @@ def _rate(name: str, hits: Any, trials: Any) -> dict[str, float]:
     return {f"grasp_success/{name}": value, f"grasp_success/{name}_low": low, f"grasp_success/{name}_high": high}
 
 
-def _usable(fault: Any) -> np.ndarray:
-    return (np.asarray(fault) & Fault.UNUSABLE) == 0
-
-
 def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], seed: int) -> dict[str, Any]:
     """A grasp of a random foreground pixel at a random angle on each table, and what the scorer thinks of it."""
     scene = structs.stack([table.scene for table in tables])
@@ -81,7 +77,7 @@ def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], s
     keys = jax.random.split(jax.random.key(seed), len(tables))
     grasps, scores = clutter.in_chunks(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
     rollout, outcome = primitives.grasp(engine, scene, poses, jax.device_get(grasps))
-    good = _usable(rollout.fault)
+    good = Fault.usable(rollout.fault)
     success = np.asarray(outcome.success, float)[good]
     found = calibration(np.asarray(scores)[good], success)
     return _rate("random_foreground", success, np.ones(len(success))) | {f"random/{k}": v for k, v in found.items()}
@@ -121,7 +117,7 @@ def _other_grasps(scorer: Scorer, engine: Engine, tables: list[Instance], count:
             rollout, outcome = primitives.grasp(
                 engine, structs.take(scene, index[rows]), poses[index[rows]], structs.take(flat, rows)
             )
-            held.append(np.asarray(outcome.success) & _usable(rollout.fault))
+            held.append(np.asarray(outcome.success) & Fault.usable(rollout.fault))
             begin += engine.batch
             progress.advance(len(held[-1]), "")
     any_held = np.concatenate(held).reshape(-1, count).any(1)
@@ -158,7 +154,7 @@ def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: i
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     index = np.repeat(np.arange(scenes), each)
     rollout, outcome = primitives.grasp(engine, structs.take(items.scene, index), items.poses[index], flat)
-    good = _usable(rollout.fault)
+    good = Fault.usable(rollout.fault)
     said, held = np.asarray(labels).reshape(-1)[good] > 0.5, np.asarray(outcome.success)[good]
     rates = {"agree": said == held, "positive_holds": held[said], "negative_fails": ~held[~said], "positive": said}
     return {"grasps": len(said)} | {name: float(np.mean(rate)) for name, rate in rates.items()}

@@ -116,7 +116,6 @@ def grasp(
     learning_rate: float = 1e-3,
     weight_decay: float = 1e-4,
     seed: int = 0,
-    limit: int | None = None,
     eval_every: int = 250,
     save_every: int = 250,
 ) -> None:
@@ -135,16 +134,13 @@ def grasp(
       learning_rate: at its highest.
       weight_decay: decay.
       seed: seed of weights, order and augmentation.
-      limit: learn from the first so many grasps of each folder only; what is held out stays the same.
       eval_every: steps between points of the learning curve.
       save_every: steps between checkpoints.
     """
     config = TrainConfig(steps, batch, learning_rate, weight_decay, "adamw", seed, eval_every, save_every)
-    if limit is not None:
-        console.require_positive(limit=limit)
     initial: Any = checkpoint.load_network(init, network="grasp") if init else None
     network_config = initial.config if initial else GraspConfig(preset=preset)
-    _fit(GraspTask(data, network_config, limit=limit), config, out, initial=initial)
+    _fit(GraspTask(data, network_config), config, out, initial=initial)
 
 
 def grasp_online(

@@ -159,13 +159,12 @@ class GraspTask:
 
     network = "grasp"
 
-    def __init__(self, data: tuple[pathlib.Path, ...], config: grasp.GraspConfig, *, limit: int | None = None) -> None:
+    def __init__(self, data: tuple[pathlib.Path, ...], config: grasp.GraspConfig) -> None:
         """Load data sets.
 
         Args:
           data: folders of grasp episodes; of each, the last tenth is held out.
           config: architecture.
-          limit: learn from the first so many grasps of each only; what is held out stays the same.
 
         Raises:
           UserError: no folder; or one is damaged, or holds something else.
@@ -175,9 +174,9 @@ class GraspTask:
         loaded = [records.load(folder, kind="grasp") for folder in data]
         slots = max(episodes.scene.shape.shape[1] for episodes, _ in loaded)
         sides = [split(_widened(episodes, slots), folder) for (episodes, _), folder in zip(loaded, data, strict=True)]
-        self.train_set = structs.concatenate([structs.take(learnt, slice(0, limit)) for learnt, _ in sides])
+        self.train_set = structs.concatenate([learnt for learnt, _ in sides])
         self.test_set = structs.concatenate([held_out for _, held_out in sides])
-        self.fingerprint = ":".join([*(fingerprint for _, fingerprint in loaded), *([str(limit)] if limit else [])])
+        self.fingerprint = ":".join(fingerprint for _, fingerprint in loaded)
         self.size = self.examples = len(self.train_set.fault)
         self.network_config = config
         self.window = WINDOWS[config.preset] + 2 * PHASE

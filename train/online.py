@@ -175,7 +175,7 @@ def _grasp(
     """One grasp on every table; what is held is taken away; tables that are empty, or stuck, are set anew."""
     taken = jax.device_get(choose(state.scene, state.poses))
     scene, poses, held, fault = clutter.grasp_away(engine, state.scene, state.poses, taken)
-    good = np.asarray((fault & Fault.UNUSABLE) == 0)
+    good = Fault.usable(fault)
     success = np.asarray(held.any(1))
     tried = GraspEpisode(state.scene, state.poses, poses, taken, held, success, fault)
     if good.any():
