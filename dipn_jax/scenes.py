@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import geometry, shapes
+from dipn_jax import geometry, packing, shapes
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Array, Scene
 from dipn_jax.workspace import WORKSPACE
@@ -44,14 +44,17 @@ class Ranges:
     """Sliding coefficient between object and table; between objects it is 0.5 / 0.35 of the larger of two."""
     color_noise: float = 0.0
     """Most by which each channel, in [0, 1], differs from a colour of the palette."""
+    packed: float = 0.0
+    """Share of scenes whose objects are not let fall but stand side by side in rows."""
 
     def __post_init__(self) -> None:
         for name, (least, most) in BOUNDS.items():
             low, high = getattr(self, name)
             if not least <= low <= high <= most:
                 raise UserError(f"--{name} {low:g} {high:g}: want two numbers from {least:g} to {most:g}, in order")
-        if not 0 <= self.color_noise <= 1:
-            raise UserError(f"--color-noise {self.color_noise:g}: want 0 to 1")
+        for name in ("color_noise", "packed"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UserError(f"--{name.replace('_', '-')} {getattr(self, name):g}: want 0 to 1")
         names = [item.name for item in shapes.CATALOGUE]
         unknown = [name for name in self.items if name not in names]
         if unknown:
@@ -107,7 +110,7 @@ def parse_objects(text: str, *, ranges: Ranges = DEFAULT_RANGES) -> SceneConfig:
 
 @functools.partial(jax.jit, static_argnames="config")
 def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Array]:
-    """Random objects in mid-air, none touching another.
+    """Random objects in mid-air, none touching another; or packed (`Ranges.packed`).
 
     Args:
       key: random key.
@@ -115,7 +118,7 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
 
     Returns:
       The scene, and poses `[N, 7]`: random positions and orientations, each object just above the
-      bounding spheres of those before it. Empty slots are parked outside the workspace.
+      bounding spheres of those before it, or rows of `packing`. Empty slots are parked outside the workspace.
     """
     n, ranges = config.slots, config.ranges
     keys = jax.random.split(key, 9)
@@ -140,6 +143,10 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
     radius = shapes.radius(shape, size)
     z = _stack_heights(xy, radius, present)
     poses = jnp.concatenate([xy, z[:, None], quat], -1)
+    if ranges.packed:
+        pack_key, which_key = jax.random.split(jax.random.fold_in(key, 1))
+        rows = packing.pack(pack_key, shape, size, present)
+        poses = jnp.where(jax.random.bernoulli(which_key, ranges.packed), rows, poses)
     poses = jnp.where(present[:, None], poses, parked(n))
     return Scene(shape.astype(jnp.int32), size, color, mass, friction), poses
 

@@ -16,7 +16,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 STAGES = ("datagen", "train", "eval")
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "structs", "workspace", "geometry", "shapes", "scenes", "model", "physics", "primitives", "render",
+    "errors", "structs", "workspace", "geometry", "shapes", "packing", "scenes", "model", "physics", "primitives", "render",
     "segment", "candidates", "imagine", "losses", "networks", "planner", "files", "codec", "records", "checkpoint",
     "clutter", "policy", "resume", "console",
 ]  # fmt: skip
