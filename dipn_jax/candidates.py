@@ -6,21 +6,23 @@ Everything runs on the device on a padded number of candidates; nothing is trace
 from __future__ import annotations
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
 
 from dipn_jax import geometry
 from dipn_jax.structs import ABSENT, Array, Grasp, Observation, Push
-from dipn_jax.workspace import GRIPPER, ROTATIONS, WORKSPACE
+from dipn_jax.workspace import GRIPPER, ROTATIONS, WORKSPACE, grasp_angles
 
 # Source of the four numbers below: DIPN's released code.
 STANDOFF = 15  # pixels from the contact back to the start
 START_RANGE = (10, 214)  # pixels
-CENTER_RANGE = (25, 199)  # pixels: a centre predicted outside (at twice the motion) drops the push
+CENTER_RANGE = (25, 199)  # pixels: a centre predicted outside drops the push
 FREE_HEIGHT = 0.01  # metres: what is lower counts as free at the start
 
 _OVERSAMPLE = 4
+_TURNED = 320  # pixels of a turned map
 _MARGIN = 0.004  # metres around the gripper's footprint
 
 
@@ -65,7 +67,7 @@ def footprint_free(height: jax.Array, start: jax.Array, angle: jax.Array) -> jax
 
 @functools.partial(jax.jit, static_argnames=("count", "slots"))
 def sample_pushes(
-    key: jax.Array, observation: Observation, *, count: int, slots: int, distance: jax.Array | float
+    key: jax.Array, observation: Observation, *, count: int, slots: int, distance: Array
 ) -> tuple[Push, jax.Array]:
     """Candidate pushes of one observation.
 
@@ -74,7 +76,7 @@ def sample_pushes(
       observation: `[224, 224]` maps.
       count: number of candidates P.
       slots: number of object slots N in the labels.
-      distance: metres, traced.
+      distance: metres, traced: one `[]`, or each candidate's own `[P]`.
 
     Returns:
       Pushes `[P]` and which of them are feasible `[P]` bool. Feasible ones come first, in random order;
@@ -97,13 +99,44 @@ def sample_pushes(
     free = jax.vmap(footprint_free, in_axes=(None, 0, 0))(height, start, angle)
     feasible = on_contour[index] & inside & free
     chosen = jnp.argsort(~feasible, stable=True)[:count]
-    distances = jnp.full((count,), distance, jnp.float32)
+    distances = jnp.broadcast_to(jnp.asarray(distance, jnp.float32), (count,))
     return Push(start[chosen], angle[chosen], distances), feasible[chosen]
 
 
+def push_at(index: Array, distance: Array) -> Push:
+    """The push that starts at `index [3]` (rotation, row, col) and goes `distance []` metres."""
+    index = jnp.asarray(index)
+    start = geometry.pixels_to_metres(jnp.stack([index[2], index[1]], -1))
+    return Push(start, index[0] * jnp.float32(2 * jnp.pi / ROTATIONS), jnp.float32(distance))
+
+
+def push_index(push: Push) -> jax.Array:
+    """The pixel and direction nearest to a push: `[3]` int32 (rotation, row, col)."""
+    pixel = jnp.round(geometry.metres_to_pixels(push.start))
+    rotation = jnp.round(push.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
+    return jnp.stack([rotation, pixel[1], pixel[0]]).astype(jnp.int32)
+
+
+def pushable(height: jax.Array) -> jax.Array:
+    """Where the closed gripper can come down, in each direction: `[16, H, W]` bool of a height map `[H, W]`."""
+    size = height.shape[0]
+    rows, cols = (2 * math.ceil(side / 2 / WORKSPACE.pixel) + 1 for side in (GRIPPER.push_width, GRIPPER.pad_width))
+    pixel = jnp.arange(size)
+    near = (pixel >= START_RANGE[0]) & (pixel <= START_RANGE[1])
+
+    def one(angle: jax.Array) -> jax.Array:
+        top = geometry.rotate_map(height, angle, _TURNED)
+        for window in ((rows, 1), (1, cols)):
+            top = jax.lax.reduce_window(top, -jnp.inf, jax.lax.max, window, (1, 1), "SAME")
+        return geometry.unrotate_map(top, angle, size)
+
+    half = jax.lax.map(one, jnp.asarray(grasp_angles()[: ROTATIONS // 2]))  # the gripper is its own mirror image
+    return jnp.tile(half < FREE_HEIGHT, (2, 1, 1)) & near[:, None] & near
+
+
 def stays_inside(centers: jax.Array, area: jax.Array, motion: jax.Array) -> jax.Array:
-    """Whether no visible centre `[N, 2]` (metres) leaves CENTER_RANGE at twice the predicted `motion [N, 3]`."""
-    pixel = geometry.metres_to_pixels(centers + 2 * motion[:, :2])
+    """Whether no visible centre `[N, 2]` (metres) leaves CENTER_RANGE by `motion [N, 3]`."""
+    pixel = geometry.metres_to_pixels(centers + motion[:, :2])
     before = geometry.metres_to_pixels(centers)
     low, high = CENTER_RANGE
     out = ((pixel < low) & (pixel < before)) | ((pixel > high) & (pixel > before))

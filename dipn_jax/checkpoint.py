@@ -22,12 +22,13 @@ from flax import nnx
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
-from dipn_jax.networks import dipn, grasp
+from dipn_jax.networks import dipn, grasp, vpg
 
 FORMAT_VERSION = 1
 NETWORKS: dict[str, tuple[type, type]] = {
     "dipn": (dipn.DipnConfig, dipn.DIPN),
     "grasp": (grasp.GraspConfig, grasp.GraspNet),
+    "vpg": (vpg.VpgConfig, vpg.VPG),
 }
 
 

@@ -111,6 +111,22 @@ def in_chunks(function: Callable[..., Any], *args: Any) -> Any:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
 
 
+def in_few(function: Callable[..., Any], *args: Any) -> Any:
+    """As `in_chunks`, FEW at a time, for functions that are dear: `function(*rows, real)` is told which rows count.
+
+    Args:
+      function: jitted, of pytrees with a leading axis, and of `real [FEW]` bool.
+      args: pytrees with a leading axis.
+    """
+    count = len(jax.tree.leaves(args)[0])
+    parts = []
+    for start in range(0, count, FEW):
+        rows = np.arange(start, start + FEW)
+        some = jax.tree.map(lambda leaf, rows=rows % count: leaf[rows], args)
+        parts.append(jax.device_get(function(*some, rows < count)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
+
+
 def observe(scene: Scene, poses: Array) -> Observation:
     """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
     return in_chunks(_observe, scene, poses)

@@ -63,11 +63,12 @@ def pack(key: jax.Array, shape: jax.Array, size: jax.Array, present: jax.Array) 
     shift = jax.random.uniform(keys[5], (2,), minval=-1.0, maxval=1.0) * room
     middle = geometry.rotate2d(jnp.stack([x, y], -1), yaw) + shift
     quat = geometry.quat_multiply(geometry.quat_about_z(yaw + jitter), turn)
-    center = jnp.concatenate([middle, extent[:, 2:] / 2 + 0.001], -1)
+    center = jnp.column_stack([middle, extent[:, 2] / 2 + 0.001])
     falls = jax.random.bernoulli(keys[6], DROPPED) & (jnp.arange(n) == present.sum() - 1)
     spot = jax.random.uniform(keys[7], (2,), minval=-0.1, maxval=0.1)
-    center = jnp.where(falls[:, None], jnp.array([*spot, 0.2]), center)
-    quat = jnp.where(falls[:, None], geometry.random_quat(keys[6], shape=(n,)), quat)
+    center = jnp.where(falls[:, None], jnp.append(spot, 0.2), center)
+    tumbled: jax.Array = geometry.random_quat(keys[6], shape=(n,))
+    quat = jnp.where(falls[:, None], tumbled, quat)
     offset = jnp.asarray(shapes.UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(shape, 0)] * size
     mass_center = center + jnp.einsum("nij,nj->ni", geometry.quat_to_matrix(quat), offset)
     return jnp.concatenate([mass_center, quat], -1)

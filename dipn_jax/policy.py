@@ -5,14 +5,15 @@ from __future__ import annotations
 import functools
 import pathlib
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from dipn_jax import checkpoint, imagine
-from dipn_jax.networks import dipn, grasp, push_frame
-from dipn_jax.planner import Predictor, Scorer
+from dipn_jax import checkpoint, imagine, planner
+from dipn_jax.networks import dipn, grasp, local, push_frame, vpg
+from dipn_jax.planner import Appraiser, Predictor, Scorer
 from dipn_jax.structs import ABSENT, Observation, Push
 
 Courses = Callable[[Observation, Push, jax.Array], jax.Array]
@@ -103,6 +104,21 @@ def grasp_scorer(model: grasp.GraspNet) -> Scorer:
     return score
 
 
+def grasp_appraiser(model: grasp.GraspNet) -> Appraiser:
+    """What all grasps on imagined images are worth, the fast way where there is one.
+
+    `compact` networks on a CPU score only what moved; elsewhere images are scored whole.
+    """
+    if model.config.preset != "compact" or jax.default_backend() != "cpu":
+        return planner.plain(grasp_scorer(model))
+    thaw = _frozen(model)
+
+    def appraise(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return local.appraise(thaw(), now, images, wanted)  # type: ignore[arg-type]
+
+    return appraise
+
+
 def load_predictor(run: pathlib.Path, slots: int) -> Predictor:
     """The predictor of a `dipn-train push` run."""
     return dipn_predictor(checkpoint.load_network(run, network="dipn"), slots)  # type: ignore[arg-type]
@@ -111,3 +127,35 @@ def load_predictor(run: pathlib.Path, slots: int) -> Predictor:
 def load_scorer(run: pathlib.Path) -> Scorer:
     """The scorer of a `dipn-train grasp` run."""
     return grasp_scorer(checkpoint.load_network(run, network="grasp"))  # type: ignore[arg-type]
+
+
+def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
+    """Scorers of pushes and of grasps; None where the network has no such part."""
+    squash = nnx.sigmoid if model.config.answers == "chance" else (lambda x: x)
+
+    def scorer(part: nnx.Module, mirrored: bool) -> Scorer:
+        thaw = _frozen(part)
+
+        def score(images: jax.Array) -> jax.Array:
+            network = thaw()
+            one = functools.partial(grasp.score_image, network, mirrored=mirrored, squash=squash)  # type: ignore[arg-type]
+            return jax.lax.map(one, images)
+
+        return score
+
+    parts = model.config.parts
+    return (
+        scorer(model.push, mirrored=False) if "push" in parts else None,
+        scorer(model.grasp, mirrored=True) if "grasp" in parts else None,
+    )
+
+
+def load_values(run: pathlib.Path) -> tuple[Scorer | None, Scorer | None]:
+    """The scorers of pushes and of grasps of a `dipn-train baseline` run."""
+    return value_scorers(checkpoint.load_network(run, network="vpg"))  # type: ignore[arg-type]
+
+
+def load_appraiser(run: pathlib.Path, *, network: str = "grasp") -> Appraiser:
+    """What all grasps on imagined images are worth to the network of a run: GN, or the grasps of a baseline (`vpg`)."""
+    model: Any = checkpoint.load_network(run, network=network)
+    return grasp_appraiser(model.grasp if network == "vpg" else model)

@@ -63,11 +63,11 @@ def push_trajectory(push: Push) -> Trajectory:
     return _frames(times, [start_high, start_low, start_low, end_low, end_low, end_high, end_high])
 
 
-def push_samples() -> np.ndarray:
-    """Seconds `[12]`: at each centimetre of travel, and at rest after 10 cm (a shorter push has ended by then)."""
+def push_samples(*, longest: float = PUSH_STEPS * 0.01) -> np.ndarray:
+    """Seconds `[12]`: at each centimetre of travel to 10, and at rest after `longest` metres."""
     begin = DESCEND_TIME + 0.1
     travel = begin + np.arange(PUSH_STEPS + 1) * 0.01 / PUSH_SPEED
-    return np.append(travel, travel[-1] + 0.1 + DESCEND_TIME + REST_TIME)
+    return np.append(travel, begin + longest / PUSH_SPEED + 0.1 + DESCEND_TIME + REST_TIME)
 
 
 def grasp_trajectory(grasp: Grasp) -> Trajectory:
@@ -96,9 +96,9 @@ def settle(
     return engine.simulate(scenes, poses, still, end, settle=True, fence=fence)
 
 
-def push(engine: Engine, scenes: Scene, poses: Array, pushes: Push) -> Rollout:
-    """Execute one push of at most 10 cm a scene; `poses [B, 12, N, 7]`: at each centimetre and at rest."""
-    rollout = engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(), settle=True)
+def push(engine: Engine, scenes: Scene, poses: Array, pushes: Push, *, longest: float = PUSH_STEPS * 0.01) -> Rollout:
+    """Execute one push of at most `longest` metres a scene; `poses [B, 12, N, 7]`: at each centimetre, and at rest."""
+    rollout = engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(longest=longest), settle=True)
     over = tipped(rollout.poses[..., 0, :, 3:], rollout.poses[..., -1, :, 3:]) & (scenes.shape >= 0)
     return rollout.replace(fault=rollout.fault | jnp.where(over.any(-1), Fault.TIPPED, 0))
 

@@ -1,136 +1,91 @@
-"""Clear tables with Alg. 2, many instances in lockstep, to the end rules of the paper."""
+"""Clear tables, many instances in lockstep, to the end rules of the paper."""
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import pathlib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import candidates, clutter, console, files, planner, policy, primitives, render, resume, structs
-from dipn_jax.errors import UserError
+from dipn_jax import clutter, console, files, primitives, resume, structs
 from dipn_jax.physics import Engine
-from dipn_jax.structs import Decision, Fault, Observation, Push, Scene
-from dipn_jax.workspace import WORKSPACE
+from dipn_jax.structs import Fault
+from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 from eval import film, metrics
+from eval.deciding import Choice, Decider
 from eval.instances import Instance
 
 ACTIONS_PER_OBJECT = 3
 """Source: the paper; more actions than that is a failure."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ClearConfig:
-    """How to decide."""
-
-    method: str = "dipn+gn"  # or gn: grasps only
-    candidates: int = 32
-    distance: float = 0.10  # metres a push goes, and is predicted for
-    gamma: float = 0.9
-    threshold: float = 0.7
-
-
 def clear(
     instances: list[Instance],
     engine: Engine,
-    predictor: planner.Predictor,
-    scorer: planner.Scorer,
-    config: ClearConfig,
+    decide: Decider,
     partial: resume.Partial,
     *,
     seed: int,
+    longest: float = PUSH_STEPS * 0.01,
 ) -> list[Instance]:
-    """Act on every instance until all have ended.
+    """Act on every instance until all have ended; those that have not are decided on, and simulated, together.
+
+    What happens on one table does not depend on the others.
 
     Args:
       instances: settled tables; changed in place, or replaced by those of an interrupted evaluation.
       engine: physics.
-      predictor: where everything goes.
-      scorer: which grasps hold.
-      config: the rule.
+      decide: what to do next.
       partial: where an interrupted evaluation is kept.
       seed: of the push candidates.
+      longest: metres of the longest push that `decide` asks for.
 
     Returns:
       The instances, ended.
     """
-    if config.method not in ("dipn+gn", "gn"):
-        raise UserError(f"--method {config.method}: want dipn+gn or gn")
     total = sum(instance.objects for instance in instances)
-    turn, instances = partial.load((0, instances))
+    instances = partial.load(instances)
+    keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(instances))]
     with console.Progress("clear", total, unit="objects", done=sum(i.removed for i in instances)) as progress:
-        while active := [instance for instance in instances if not instance.ended]:
+        while active := [number for number, instance in enumerate(instances) if not instance.ended]:
+            rows = [instances[number] for number in active]
             before = sum(instance.removed for instance in instances)
-            was = [(instance.scene.shape, instance.poses) for instance in active]
-            step = jax.random.fold_in(jax.random.key(seed), turn)
-            decisions = [
-                _decide(jax.random.fold_in(step, i), instance, predictor, scorer, config)
-                for i, instance in enumerate(active)
-            ]
-            pushing = [(a, s, d) for a, (s, d) in zip(active, decisions, strict=True) if bool(d.is_push)]
-            grasping = [(a, s, d) for a, (s, d) in zip(active, decisions, strict=True) if not bool(d.is_push)]
-            if pushing:
-                _push(pushing, engine)
-            if grasping:
-                _grasp(grasping, engine)
-            for instance, state, (_, decision) in zip(active, was, decisions, strict=True):
-                _remember(instance, state, decision)
+            scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
+            now = jnp.stack([jax.random.fold_in(keys[number], instances[number].actions) for number in active])
+            choice = decide(now, scene, poses)
+            for is_push, act in ((True, functools.partial(_push, longest=longest)), (False, _grasp)):
+                which = np.flatnonzero(choice.is_push == is_push)
+                if len(which):
+                    act([rows[i] for i in which], structs.take(choice, which), engine)
+            for i, instance in enumerate(rows):
+                _remember(instance, (scene.shape[i], poses[i]), structs.take(choice, i))
                 instance.ended = instance.ended or _ended(instance)
-            turn += 1
-            partial.save((turn, instances))
+            partial.save(instances)
             removed = sum(instance.removed for instance in instances) - before
-            done = len(instances) - sum(not instance.ended for instance in instances)
+            done = sum(bool(instance.ended) for instance in instances)
             progress.advance(removed, f"{done}/{len(instances)} tables ended")
     return instances
 
 
-def _decide(
-    key: jax.Array, instance: Instance, predictor: planner.Predictor, scorer: planner.Scorer, config: ClearConfig
-) -> tuple[Observation, Decision]:
-    seen = render.render(instance.scene, instance.poses)
-    decision = planner.decide(
-        key,
-        seen,
-        predictor,
-        scorer,
-        count=config.candidates,
-        slots=len(instance.scene.shape),
-        distance=config.distance,
-        gamma=config.gamma,
-        threshold=config.threshold if config.method == "dipn+gn" else -1.0,
-    )
-    return seen, jax.device_get(decision)
-
-
-Acting = list[tuple[Instance, Observation, Decision]]
-
-
-def _stack(rows: Acting) -> tuple[Scene, np.ndarray]:
-    scene = jax.tree.map(lambda *leaves: np.stack(leaves), *[instance.scene for instance, _, _ in rows])
-    return scene, np.stack([instance.poses for instance, _, _ in rows])
-
-
-def _push(rows: Acting, engine: Engine) -> None:
-    scene, poses = _stack(rows)
-    pushes: Push = jax.tree.map(lambda *leaves: np.stack(leaves), *[decision.push for _, _, decision in rows])
-    rollout = primitives.push(engine, scene, poses, pushes)
+def _push(rows: list[Instance], choice: Choice, engine: Engine, *, longest: float) -> None:
+    scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
+    rollout = primitives.push(engine, scene, poses, choice.push, longest=longest)
     wrong = ~Fault.usable(rollout.fault)
-    for i, (instance, _, _) in enumerate(rows):
+    for i, instance in enumerate(rows):
         instance.pushes += 1
         instance.ended = "fault" if wrong[i] else ""
         instance.poses = np.asarray(rollout.poses)[i, -1]
         instance.did.append("push")
 
 
-def _grasp(rows: Acting, engine: Engine) -> None:
-    scene, poses = _stack(rows)
-    taken = [candidates.grasp_at(decision.grasp_pixel, seen.height) for _, seen, decision in rows]
-    grasps = jax.tree.map(lambda *leaves: np.stack(leaves), *taken)
-    scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, grasps)
+def _grasp(rows: list[Instance], choice: Choice, engine: Engine) -> None:
+    scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
+    scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, choice.grasp)
     wrong = ~Fault.usable(fault)
-    for i, (instance, _, _) in enumerate(rows):
+    for i, instance in enumerate(rows):
         instance.grasps += 1
         instance.held += bool(held[i].any())
         instance.ended = "fault" if wrong[i] else ""
@@ -139,17 +94,17 @@ def _grasp(rows: Acting, engine: Engine) -> None:
         instance.did.append("grasp held" if held[i].any() else "grasp missed")
 
 
-def _remember(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: Decision) -> None:
+def _remember(instance: Instance, state: tuple[np.ndarray, np.ndarray], choice: Choice) -> None:
     """Keep what a frame can be drawn from again: where everything was, and what was decided."""
-    push = decision.push
+    push = choice.push
     instance.film.append(
         {
             "shape": state[0],
             "poses": state[1],
             "push": np.array([*push.start, push.angle, push.distance], np.float32),
-            "grasp": np.asarray(decision.grasp_pixel),
-            "values": np.array([decision.grasp_score, decision.value_now, decision.value_push], np.float32),
-            "motion": np.asarray(decision.motion, np.float32),
+            "grasp": choice.grasp_pixel,
+            "values": choice.values.astype(np.float32),
+            "motion": choice.motion.astype(np.float32),
         }
     )
 
@@ -211,16 +166,3 @@ def save(instances: list[Instance], out: pathlib.Path) -> None:
             }
         )
     files.write_json(out / "episodes.json", lines)
-
-
-def load_policies(config: ClearConfig, push_net: pathlib.Path | None, grasp_net: pathlib.Path, slots: int) -> Any:
-    """Predictor and scorer for a method.
-
-    Raises:
-      UserError: the method needs a push network and none was given.
-    """
-    if config.method == "gn":
-        return policy.static_predictor(slots), policy.load_scorer(grasp_net)
-    if push_net is None:
-        raise UserError(f"--method {config.method}: wants --push-net; give a run of dipn-train push")
-    return policy.load_predictor(push_net, slots), policy.load_scorer(grasp_net)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import sys
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
+from dipn_jax import cases as case_files
 from dipn_jax import checkpoint, console, files, policy, resume, scenes
 from dipn_jax.errors import UserError
-from dipn_jax.physics import EngineName, make_engine
-from eval import clearing, grasp_curve, grasping, metrics, prediction
+from dipn_jax.physics import Engine, EngineName, make_engine
+from eval import clearing, deciding, grasp_curve, grasping, metrics, prediction
 from eval import curve as curves
 from eval import instances as tables_to_clear
 from eval import report as reporting
+from eval.instances import Instance
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
@@ -165,70 +167,128 @@ def grasp(
     _finish(out, values, settings, partial)
 
 
+@dataclasses.dataclass(frozen=True)
+class Tables:
+    """Which tables are cleared."""
+
+    cases: str = "hard"
+    """hard (the ten hand-placed instances), random, or a case file of your own."""
+    names: tuple[str, ...] = ()
+    """Only these cases of the file."""
+    objects: Objects = "10"
+    """Number of objects (random)."""
+    instances: int = 1
+    """Tables (random), or repeats of each case with perturbed physics."""
+
+    def __post_init__(self) -> None:
+        console.require_positive(instances=self.instances)
+
+    def path(self) -> pathlib.Path | None:
+        """The case file, if there is one."""
+        if self.cases == "random":
+            return None
+        return case_files.hard_cases_path() if self.cases == "hard" else pathlib.Path(self.cases)
+
+    def slots(self) -> int:
+        """Most objects on one of them."""
+        path = self.path()
+        if path is None:
+            return scenes.parse_objects(self.objects).slots
+        return int(case_files.load_cases(path)[1].shape.shape[1])
+
+    def make(self, engine: Engine, *, seed: int) -> list[Instance]:
+        """All of them, at rest."""
+        path = self.path()
+        if path is None:
+            config = scenes.parse_objects(self.objects)
+            return tables_to_clear.random_instances(engine, config, count=self.instances, seed=seed)
+        options: dict[str, Any] = {"slots": self.slots(), "repeats": self.instances, "seed": seed}
+        return tables_to_clear.hard_instances(engine, path, list(self.names) or None, **options)
+
+
+DEFAULT_TABLES = Tables()
+
+
 def clear(
-    grasp_net: pathlib.Path,
     out: pathlib.Path,
+    method: deciding.MethodName = "dipn+gn",
     push_net: pathlib.Path | None = None,
-    method: Literal["dipn+gn", "gn"] = "dipn+gn",
-    cases: str = "hard",
-    names: tuple[str, ...] = (),
-    objects: Objects = "10",
-    instances: int = 1,
+    grasp_net: pathlib.Path | None = None,
+    value_net: pathlib.Path | None = None,
+    tables: Annotated[Tables, tyro.conf.arg(name="")] = DEFAULT_TABLES,
     candidates: int = 32,
     distance: float = 0.10,
     gamma: float = 0.9,
     threshold: float = 0.7,
+    released: bool = False,
     seed: int = 1_000_000,
     engine: EngineName = "auto",
 ) -> None:
-    """Clear tables with Alg. 2: push or grasp, until nothing is left.
+    """Clear tables: push or grasp, until nothing is left.
 
-      dipn-eval clear --push-net runs/dipn --grasp-net runs/gn --cases hard --out results/hard
-      dipn-eval clear --push-net runs/dipn --grasp-net runs/gn --cases random --instances 30 --out results/random
+      dipn-eval clear --push-net builtin --grasp-net builtin --cases hard --instances 30 --out results/hard
+      dipn-eval clear --push-net builtin --grasp-net builtin --cases random --objects 30 --instances 30 --out results/30
+
+    The compared methods: gn (grasps only), physics+gn (the engine itself as predictor), and with networks of dipn-train
+    baseline rea+dipn, dqn+gn and vpg:
+      dipn-eval clear --method dqn+gn --value-net runs/dqn --grasp-net builtin --out results/dqn
 
     Args:
-      grasp_net: run of dipn-train grasp.
       out: folder for metrics.json and every step of every table.
+      method: who decides.
       push_net: run of dipn-train push, or builtin.
-      method: dipn+gn, or gn: grasps only.
-      cases: hard (the ten hand-placed instances), random, or a case file of your own.
-      names: only these cases of the file.
-      objects: number of objects (random).
-      instances: tables (random), or repeats of each case with perturbed physics.
+      grasp_net: run of dipn-train grasp, or builtin.
+      value_net: run of dipn-train baseline.
+      tables: which.
       candidates: pushes considered at a time.
       distance: metres of a push.
       gamma: discount of a push's value.
       threshold: grasp at once above this score.
+      released: decide by the clauses of DIPN's released code, too: a lone object is grasped, a push must raise the best
+        score, gamma discounts only pushes after which that is over 0.5, and no object may come near the edge.
       seed: of scenes, perturbations and candidates.
       engine: physics.
     """
-    settings = dict(locals())
-    _check(out, seed, instances=instances, candidates=candidates)
+    settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+    del settings["tables"]
+    plan = _plan(out, seed, method, candidates, (distance,), gamma, threshold, released)
+    values, ended, partial = _cleared(out, plan, deciding.Nets(push_net, grasp_net, value_net), tables, settings)
+    clearing.save(ended, out)
+    _finish(out, values, settings, partial)
+
+
+def _plan(
+    out: pathlib.Path,
+    seed: int,
+    method: deciding.MethodName,
+    candidates: int,
+    distances: tuple[float, ...],
+    gamma: float,
+    threshold: float,
+    released: bool,
+) -> deciding.Plan:
+    """The plan of options that make sense."""
+    _check(out, seed, candidates=candidates)
     console.require_between(1, MAX_CANDIDATES, candidates=candidates)
-    console.require_between(0.01, 0.10, distance=distance)
+    for distance in distances:
+        console.require_between(0.01, deciding.LONGEST, distance=distance)
     console.require_between(0.0, 10.0, gamma=gamma, threshold=threshold)
-    physics = make_engine(engine)
-    config = clearing.ClearConfig(method, candidates, distance, gamma, threshold)
-    if cases == "random":
-        scene_config = scenes.parse_objects(objects)
-        slots = scene_config.slots
-    else:
-        path = scenes.hard_cases_path() if cases == "hard" else pathlib.Path(cases)
-        slots = scenes.load_cases(path)[1].shape.shape[1]
-    predictor, scorer = clearing.load_policies(config, push_net, grasp_net, slots)
-    if cases == "random":
-        tables = tables_to_clear.random_instances(physics, scene_config, count=instances, seed=seed)
-    else:
-        tables = tables_to_clear.hard_instances(
-            physics, path, list(names) or None, slots=slots, repeats=instances, seed=seed
-        )
-    inputs = [checkpoint.find(grasp_net, network="grasp"), *([] if cases == "random" else [path])]
-    if push_net:
-        inputs.append(checkpoint.find(push_net, network="dipn"))
+    return deciding.Plan(method, candidates, distances, gamma, threshold, released)
+
+
+def _cleared(
+    out: pathlib.Path, plan: deciding.Plan, nets: deciding.Nets, tables: Tables, settings: dict[str, Any]
+) -> tuple[dict[str, Any], list[Instance], resume.Partial]:
+    """Metrics, and the tables, ended."""
+    seed = settings["seed"]
+    path, slots = tables.path(), tables.slots()
+    inputs = [*nets.require(plan.method).values(), *([path] if path else [])]
+    physics = make_engine(settings["engine"])
+    decide = deciding.load(plan, nets, physics, slots=slots)
     partial = resume.Partial(out, settings, inputs=inputs)
-    tables = clearing.clear(tables, physics, predictor, scorer, config, partial, seed=seed)
-    clearing.save(tables, out)
-    _finish(out, clearing.summary(tables), settings, partial)
+    start = tables.make(physics, seed=seed)
+    ended = clearing.clear(start, physics, decide, partial, seed=seed, longest=plan.longest())
+    return clearing.summary(ended), ended, partial
 
 
 def report(

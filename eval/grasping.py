@@ -12,13 +12,13 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import candidates, clutter, console, policy, primitives, render, resume, structs
+from dipn_jax import candidates, clutter, console, primitives, render, resume, structs
 from dipn_jax.networks.grasp import label_image
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Scorer
 from dipn_jax.scenes import SceneConfig
 from dipn_jax.structs import Fault, Grasp, Scene
-from eval import clearing, instances, metrics
+from eval import clearing, deciding, instances, metrics
 from eval.instances import Instance
 
 BINS = 10
@@ -50,9 +50,7 @@ def evaluate(
     """
     tables = instances.random_instances(engine, config, count=scenes, seed=seed)
     result = _random_foreground(scorer, engine, tables, seed)
-    plan = clearing.ClearConfig("gn")
-    nothing_moves = policy.static_predictor(config.slots)
-    tables = clearing.clear(tables, engine, nothing_moves, scorer, plan, partial, seed=seed)
+    tables = clearing.clear(tables, engine, deciding.best_grasp(scorer, slots=config.slots), partial, seed=seed)
     held = [np.array([did == "grasp held" for did in table.did], float) for table in tables]
     scores = np.concatenate([[step["values"][0] for step in table.film] for table in tables])
     result |= _rate("gn", [each.sum() for each in held], [len(each) for each in held])

@@ -8,7 +8,7 @@ import pathlib
 import jax
 import numpy as np
 
-from dipn_jax import clutter, primitives, scenes, structs
+from dipn_jax import cases, clutter, primitives, scenes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Fault, Scene
@@ -43,7 +43,7 @@ def hard_instances(
     Raises:
       UserError: a name is not in the file.
     """
-    found, scene, poses = scenes.load_cases(path, slots=slots)
+    found, scene, poses = cases.load_cases(path, slots=slots)
     wanted = names or found
     missing = [name for name in wanted if name not in found]
     if missing:

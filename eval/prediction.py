@@ -23,13 +23,12 @@ from dipn_jax import (
     render,
     resume,
     segment,
-    shapes,
     structs,
 )
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DIPN
 from dipn_jax.physics import Engine
-from dipn_jax.scenes import SceneConfig
+from dipn_jax.scenes import SceneConfig, nominal
 from dipn_jax.structs import Fault, Observation, Push, Scene, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
 
@@ -148,8 +147,8 @@ def _execute(
     good = (np.asarray(result.fault) & Fault.UNUSABLE) == 0
     rolled = None
     if physics:
-        nominal = primitives.push(engine, _nominal(items.scene), items.poses, pushes)
-        rolled = np.asarray(nominal.poses)[good][:, list(DISTANCES)]
+        guessed = primitives.push(engine, nominal(items.scene), items.poses, pushes)
+        rolled = np.asarray(guessed.poses)[good][:, list(DISTANCES)]
     truth = np.asarray(result.poses)[good][:, [0, *DISTANCES]]
     return structs.take(items, good), structs.take(pushes, good), truth, rolled
 
@@ -277,13 +276,6 @@ def _summary(rows: Rows, names: list[str], segmented: bool) -> dict[str, float]:
     metrics["objects"] = int(visible.sum())
     metrics["pushes"] = len(visible)
     return metrics
-
-
-def _nominal(scene: Scene) -> Scene:
-    """The scene as one who sees only shapes would guess it: density 500 kg/m^3, friction 0.35."""
-    shape = np.asarray(scene.shape)
-    mass = np.where(shape >= 0, 500.0 * shapes.volume(shape, np.asarray(scene.size)), 0.1)
-    return scene.replace(mass=mass.astype(np.float32), friction=np.full(shape.shape, 0.35, np.float32))
 
 
 def _film(

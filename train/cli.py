@@ -1,4 +1,4 @@
-"""`dipn-train`: push, grasp-pretrain, grasp, grasp-online, export."""
+"""`dipn-train`: push, grasp-pretrain, grasp, grasp-online, baseline, export."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import pathlib
 import sys
 from typing import Any, Literal
 
-from dipn_jax import checkpoint, console, scenes
+from dipn_jax import checkpoint, console, policy, scenes
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.physics import EngineName, make_engine
+from train import baseline as baselines
 from train import online
 from train.grasp import GraspTask, PretrainTask
 from train.loop import Task, TrainConfig, fit
@@ -189,6 +190,51 @@ def grasp_online(
     console.say(f"{out}: " + ", ".join(f"{name} {value:.3f}" for name, value in result.items()))
 
 
+def baseline(
+    out: pathlib.Path,
+    method: baselines.MethodName = "vpg",
+    grasp_net: pathlib.Path | None = None,
+    actions: int = 2500,
+    objects: str = "10",
+    tables: int = 10,
+    updates: int = 10,
+    batch: int = 32,
+    learning_rate: float = 5e-4,
+    weight_decay: float = 1e-4,
+    seed: int = 0,
+    engine: EngineName = "auto",
+) -> None:
+    """A compared method learns while it acts: VPG, the grasps of its reactive form (REA), or DQN's pushes beside GN.
+
+    With the samples that the paper gives them, 10 to 25 minutes each on two cores:
+      dipn-train baseline --method vpg --actions 2500 --out runs/vpg
+      dipn-train baseline --method rea --actions 1500 --out runs/rea
+      dipn-train baseline --method dqn --actions 1500 --grasp-net runs/gn --out runs/dqn
+
+    Args:
+      out: run folder; the same command goes on where it stopped.
+      method: vpg, rea or dqn.
+      grasp_net: run of dipn-train grasp or grasp-online, or builtin, whose grasps dqn takes.
+      actions: pushes and grasps in all.
+      objects: number of objects on a fresh table: 10, or 1:7.
+      tables: acted on side by side.
+      updates: optimizer steps after an action on each table.
+      batch: outcomes a step, of pushes and of grasps each.
+      learning_rate: constant.
+      weight_decay: decay.
+      seed: seed of scenes, weights, order and exploration.
+      engine: physics.
+    """
+    console.require_positive(actions=actions, tables=tables, updates=updates, batch=batch, learning_rate=learning_rate)
+    console.require_between(0, 1, weight_decay=weight_decay)
+    console.require_seed(seed)
+    console.require_out(out)
+    config = baselines.BaselineConfig(method, actions, tables, updates, batch, learning_rate, weight_decay, seed)
+    scorer = policy.load_scorer(checkpoint.find(grasp_net, network="grasp")) if grasp_net else None
+    result = baselines.learn(make_engine(engine), scenes.parse_objects(objects), config, out, scorer=scorer)
+    console.say(f"{out}: " + ", ".join(f"{name} {value:.3f}" for name, value in result.items()))
+
+
 def export(
     run: pathlib.Path,
     out: pathlib.Path,
@@ -213,6 +259,7 @@ COMMANDS = {
     "grasp-pretrain": grasp_pretrain,
     "grasp": grasp,
     "grasp-online": grasp_online,
+    "baseline": baseline,
     "export": export,
 }
 

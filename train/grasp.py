@@ -96,12 +96,12 @@ class PretrainTask:
 
 @flax.struct.dataclass
 class Window(Pytree):
-    """What one executed grasp teaches; its closing axis lies along the columns."""
+    """What one executed action teaches; a grasp's closing axis, or a push, lies along the columns."""
 
-    height: Array  # [W, W] float16 metres; the grasp is at the centre of pixel (W / 2, W / 2)
+    height: Array  # [W, W] float16 metres; the action is at the centre of pixel (W / 2, W / 2)
     label: Array  # [W, W] int8: object slot, ABSENT on the table
     color: Array  # [N, 3] in [0, 1], of the objects
-    success: Array  # [] bool
+    target: Array  # [] float32: 1 if a grasp held, 0 if not; or another measure of what came of it
 
 
 @functools.partial(jax.jit, static_argnames="pixels")
@@ -114,7 +114,7 @@ def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
             episode.scene, episode.poses, episode.grasp.center - half, episode.grasp.angle, pixels=pixels
         )
         height, label = seen.height.astype(jnp.float16), seen.label.astype(jnp.int8)
-        return Window(height, label, episode.scene.color, episode.success)
+        return Window(height, label, episode.scene.color, episode.success.astype(jnp.float32))
 
     return jax.lax.map(one, episodes)
 
@@ -130,11 +130,11 @@ def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array
     palette = jnp.asarray(shapes.COLORS_RGB, jnp.float32) / 255
     drawn = jax.random.randint(color_key, batch.color.shape[:2], 0, len(palette))
     batch = batch.replace(color=palette[drawn])  # what an object is like is not in its colour
-    images, pixel = view(batch, jax.random.randint(phase_key, (len(batch.success), 2), 0, 2 * PHASE))
+    images, pixel = view(batch, jax.random.randint(phase_key, (len(batch.target), 2), 0, 2 * PHASE))
     mask = jnp.zeros(images.shape[:3]).at[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]].set(1.0)
     images, mask = _flips(flip_key, images, mask)
     logits = (model(images) * mask).sum((1, 2))
-    return losses.score_loss(logits, batch.success.astype(jnp.float32), jnp.ones(len(images)))
+    return losses.score_loss(logits, batch.target, jnp.ones(len(images)))
 
 
 def view(batch: Window, begin: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -202,7 +202,7 @@ class GraspTask:
         with console.Progress("render windows", count, unit="grasps") as progress:
             for begin in range(0, count, some):
                 made.append(self.prepare(structs.take(episodes, slice(begin, begin + some))))
-                progress.advance(len(made[-1].success), "")
+                progress.advance(len(made[-1].target), "")
         return structs.concatenate(made)
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
@@ -225,10 +225,10 @@ class GraspTask:
 @functools.partial(jax.jit, static_argnums=0)
 def _measure(graph: Any, state: Any, batch: Window, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Weighted sums over grasps `[B]` of the loss and of how many are told right."""
-    images, pixel = view(batch, jnp.full((len(batch.success), 2), PHASE))
+    images, pixel = view(batch, jnp.full((len(batch.target), 2), PHASE))
     logits = nnx.merge(graph, state)(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
-    loss = losses.score_loss(logits, batch.success.astype(jnp.float32), weight) * weight.sum()
-    return loss, ((logits > 0) == batch.success) @ weight
+    loss = losses.score_loss(logits, batch.target, weight) * weight.sum()
+    return loss, ((logits > 0) == (batch.target > 0.5)) @ weight
 
 
 def _widened(episodes: GraspEpisode, slots: int) -> GraspEpisode:

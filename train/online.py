@@ -19,13 +19,12 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig, score_image
 from dipn_jax.physics import Engine
 from dipn_jax.scenes import SceneConfig
-from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene, SettledScene
-from dipn_jax.workspace import WORKSPACE
+from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
+from train import tables
 from train.grasp import PHASE, WINDOWS, Window, executed_loss, windows
 from train.loop import make_step
+from train.tables import Tables
 
-PATIENCE = 3
-"""Grasps that miss in a row before a table is set anew."""
 RECENT = 50
 """Grasps over which the success of the moment is counted."""
 
@@ -50,12 +49,8 @@ class State:
 
     params: Any  # of the network
     moments: Any  # of the optimizer
-    scene: Scene  # [T, N] the tables
-    poses: np.ndarray  # [T, N, 7]
-    spare: SettledScene  # tables to come
-    drawn: int = 0  # batches of tables that were drawn
+    tables: Tables
     round: int = 0
-    missed: list[int] = dataclasses.field(default_factory=list)  # [T] grasps in a row
     seen: list[Window] = dataclasses.field(default_factory=list)  # what was tried, a batch a round
     success: list[bool] = dataclasses.field(default_factory=list)  # in the order of the grasps
 
@@ -105,12 +100,16 @@ def learn(
         optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
     )
     step = make_step(_Outcomes(), graph, optimizer)
-    state: State = partial.load(None) or _begin(params, optimizer, engine, scenes, config)
+    state: State | None = partial.load(None)
+    if state is None:
+        fresh = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
+        params = jax.device_get(params)
+        state = State(params, jax.device_get(optimizer.init(params)), fresh)
     total = -(-config.grasps // config.tables)
     key = jax.random.key(config.seed)
     with console.Progress("grasp and learn", total, unit="rounds", done=state.round) as progress:
         while state.round < total:
-            _grasp(state, functools.partial(_choose, graph, state.params, rest), engine, scenes, config)
+            _grasp(state, functools.partial(_choose, graph, state.params, rest), engine, scenes)
             state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
             state.round += 1
             partial.save(state)
@@ -134,27 +133,6 @@ class _Outcomes:
         return executed_loss(key, model, batch)
 
 
-def _begin(params: Any, optimizer: Any, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> State:
-    """The state before the first grasp."""
-    params = jax.device_get(params)
-    empty: Any = None
-    state = State(params, jax.device_get(optimizer.init(params)), empty, empty, empty)
-    state.missed = [0] * config.tables
-    _draw(state, engine, scenes, config)
-    first = structs.take(state.spare, slice(0, config.tables))
-    state.scene, state.poses = first.scene, first.poses
-    state.spare = structs.take(state.spare, slice(config.tables, None))
-    return state
-
-
-def _draw(state: State, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> None:
-    """More tables to come."""
-    key = jax.random.fold_in(jax.random.key(config.seed), state.drawn)
-    fresh = clutter.settled_exactly(key, engine, scenes, 2 * config.tables)
-    state.spare = fresh if state.spare is None else structs.concatenate([state.spare, fresh])
-    state.drawn += 1
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def _choose(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) -> Grasp:
     """The best grasp on each of the tables `[T]`."""
@@ -169,35 +147,18 @@ def _choose(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) 
     return jax.lax.map(one, (scene, poses))
 
 
-def _grasp(
-    state: State, choose: Callable[..., Grasp], engine: Engine, scenes: SceneConfig, config: OnlineConfig
-) -> None:
+def _grasp(state: State, choose: Callable[..., Grasp], engine: Engine, scenes: SceneConfig) -> None:
     """One grasp on every table; what is held is taken away; tables that are empty, or stuck, are set anew."""
-    taken = jax.device_get(choose(state.scene, state.poses))
-    scene, poses, held, fault = clutter.grasp_away(engine, state.scene, state.poses, taken)
+    before = state.tables
+    taken = jax.device_get(choose(before.scene, before.poses))
+    scene, poses, held, fault = clutter.grasp_away(engine, before.scene, before.poses, taken)
     good = Fault.usable(fault)
     success = np.asarray(held.any(1))
-    tried = GraspEpisode(state.scene, state.poses, poses, taken, held, success, fault)
+    tried = GraspEpisode(before.scene, before.poses, poses, taken, held, success, fault)
     if good.any():
         state.seen.append(windows(structs.take(tried, good), pixels=WINDOWS["compact"] + 2 * PHASE))
     state.success += [bool(one) for one in np.asarray(success)[good]]
-    missed = np.where(success, 0, np.array(state.missed) + 1)
-    outside = ((np.abs(poses[..., :2]) > WORKSPACE.half).any(-1) & (scene.shape >= 0)).any(1)
-    again = ~good | outside | (missed >= PATIENCE) | ~(scene.shape >= 0).any(1)
-    over = np.flatnonzero(again)
-    state.scene, state.poses, state.missed = scene, poses.copy(), np.where(again, 0, missed).tolist()
-    while len(np.asarray(state.spare.fault)) < len(over):
-        _draw(state, engine, scenes, config)
-    fresh = structs.take(state.spare, slice(0, len(over)))
-    state.spare = structs.take(state.spare, slice(len(over), None))
-    state.poses[over] = fresh.poses
-    state.scene = jax.tree.map(functools.partial(_replaced, over), state.scene, fresh.scene)
-
-
-def _replaced(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    result = np.array(old)
-    result[where] = new
-    return result
+    state.tables.step(scene, poses, success, good, engine, scenes)
 
 
 def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineConfig, key: jax.Array) -> tuple[Any, Any]:
@@ -208,7 +169,7 @@ def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineCon
     rng = np.random.default_rng([config.seed, state.round])
     params, moments = jax.tree.map(jax.numpy.array, (state.params, state.moments))
     for k in range(config.updates):
-        batch = structs.take(seen, rng.integers(len(seen.success), size=config.batch))
+        batch = structs.take(seen, rng.integers(len(seen.target), size=config.batch))
         params, rest, moments, _ = step(
             params, jax.tree.map(jax.numpy.array, rest), moments, batch, jax.random.fold_in(key, k)
         )

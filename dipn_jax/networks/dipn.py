@@ -13,6 +13,9 @@ from dipn_jax.networks import push_frame, resnet, stepwise
 from dipn_jax.networks.push_frame import PushInput, View
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 
+BEYOND = 2
+"""Centimetres past those of the data that a push may go."""
+
 
 @dataclasses.dataclass(frozen=True)
 class DipnConfig:
@@ -96,10 +99,15 @@ def _others(present: jax.Array) -> jax.Array:
 
 
 def _along(course: jax.Array, distances: jax.Array) -> jax.Array:
-    """Motions `[B, N, K, 3]` after `distances [B, K]` (metres) of courses `[B, N, PUSH_STEPS, 3]`."""
-    knots = jnp.concatenate([jnp.zeros_like(course[:, :, :1]), course], 2)
-    at = jnp.clip(distances * 100, 0, PUSH_STEPS)
-    weight = jnp.maximum(0.0, 1 - jnp.abs(at[..., None] - jnp.arange(PUSH_STEPS + 1)))  # linear interpolation
+    """Motions `[B, N, K, 3]` after `distances [B, K]` (metres) of courses `[B, N, PUSH_STEPS, 3]`.
+
+    Beyond the last recorded centimetre objects go on as they did in it.
+    """
+    last = course[:, :, -1:] - course[:, :, -2:-1]
+    beyond = [course[:, :, -1:] + k * last for k in range(1, BEYOND + 1)]
+    knots = jnp.concatenate([jnp.zeros_like(last), course, *beyond], 2)
+    at = jnp.clip(distances * 100, 0, PUSH_STEPS + BEYOND)
+    weight = jnp.maximum(0.0, 1 - jnp.abs(at[..., None] - jnp.arange(PUSH_STEPS + BEYOND + 1)))  # linear interpolation
     return jnp.einsum("bks,bnsd->bnkd", weight, knots)
 
 

@@ -125,54 +125,67 @@ def _normalized(images: jax.Array) -> jax.Array:
     return (images - jnp.array([*render.TABLE_COLOR, 0.0])) / jnp.array(SCALE)
 
 
-def score_image(network: GraspNet, image: jax.Array) -> jax.Array:
+def score_image(
+    network: GraspNet,
+    image: jax.Array,
+    *,
+    mirrored: bool = True,
+    squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
+) -> jax.Array:
     """All grasps of one image.
 
     Args:
-      network: GN, in evaluation mode.
+      network: GN, or another of its kind, in evaluation mode.
       image: `[224, 224, 4]`.
+      mirrored: the gripper is its own mirror image, a grasp turned by half a turn the same grasp, so the `compact`
+        network is asked for half of the rotations. Not so a push.
+      squash: from the network's outputs to scores.
 
     Returns:
       Scores `[16, 224, 224]` in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
     """
     if network.config.preset == "compact":
-        body: Any = network.body
-        return _score_cells(body.cells, image)
+        turns = ROTATIONS // 2 if mirrored else ROTATIONS
+        _, back = turning_tables(turns)
+        scores = squash(score_cells(network, image, turns)).reshape(-1)[back]
+        return jnp.tile(scores, (ROTATIONS // turns, 1, 1))
     angles = jnp.asarray(grasp_angles())
     table = jnp.array([*render.TABLE_COLOR, 0.0])
     views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, VIEW) + table)(angles)
-    scores = nnx.sigmoid(network(views))
+    scores = squash(network(views))
     return jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
 
 
-def _score_cells(cells: Callable[[jax.Array], jax.Array], image: jax.Array) -> jax.Array:
-    """As `score_image`: turned, cut into cells and turned back by tables that are made once.
+def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:
+    """Logits `[turns, 80, 80, 16]` of the pixels of all cells of the first `turns` turned views, `compact` only.
 
-    The gripper is its own mirror image: a grasp turned by half a turn is the same grasp, so half of the rotations are
-    scored and repeated.
+    Turned and cut into cells by a table that is made once.
     """
-    there, back = _turning_tables()
-    flat = jnp.concatenate([_normalized(image).reshape(-1, 4), jnp.zeros((1, 4))])
-    views = flat[there].reshape(*there.shape[:3], -1)
-    scores = nnx.sigmoid(cells(views).reshape(-1))[back]
-    return jnp.tile(scores, (2, 1, 1))
+    there, _ = turning_tables(turns)
+    body: Any = network.body
+    return body.cells(flat_pixels(image)[there].reshape(*there.shape[:3], -1))
+
+
+def flat_pixels(image: jax.Array) -> jax.Array:
+    """The normalized pixels of an image `[H, W, 4]` as rows, and one of the table: what `turning_tables` points to."""
+    return jnp.concatenate([_normalized(image).reshape(-1, 4), jnp.zeros((1, 4))])
 
 
 @functools.cache
-def _turning_tables() -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel comes from when half of the rotations are applied, and undone.
+def turning_tables(turns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel comes from when the first `turns` rotations are applied, and undone.
 
     Returns:
-      Of each pixel of each cell of the turned views, the pixel of the image `[8, 80, 80, 16]` (the one past the end is
-      table), and of each pixel of each score map the place in the logits of all cells `[8, 224, 224]`.
+      Of each pixel of each cell of the turned views, the pixel of the image `[turns, 80, 80, 16]` (the one past the end
+      is table), and of each pixel of each score map the place in the logits of all cells `[turns, 224, 224]`.
     """
-    side, count, cells = WORKSPACE.pixels, ROTATIONS // 2, VIEW // BLOCK
+    side, cells = WORKSPACE.pixels, VIEW // BLOCK
     with jax.ensure_compile_time_eval():
-        angles = jnp.asarray(grasp_angles()[:count])
+        angles = jnp.asarray(grasp_angles()[:turns])
         image = jnp.arange(side**2).reshape(side, side)
         turned = jax.vmap(lambda a: geometry.rotate_map(image, a, VIEW, side**2))(angles)
-        views = jnp.arange(count * VIEW**2).reshape(count, cells, cells, BLOCK, BLOCK)
-        views = views.transpose(0, 1, 3, 2, 4).reshape(count, VIEW, VIEW)
+        views = jnp.arange(turns * VIEW**2).reshape(turns, cells, cells, BLOCK, BLOCK)
+        views = views.transpose(0, 1, 3, 2, 4).reshape(turns, VIEW, VIEW)
         back = jax.vmap(lambda v, a: geometry.unrotate_map(v, a, side))(views, angles)
         there = resnet.space_to_depth(turned[..., None], BLOCK)
     return np.asarray(there), np.asarray(back)

@@ -62,7 +62,7 @@ def test_a_push_off_the_table_is_dropped() -> None:
     centers, area = jnp.array([[0.15, 0.0], [0.0, 0.0]]), jnp.array([100.0, 100.0])
     still = jnp.zeros((2, 3))
     assert candidates.stays_inside(centers, area, still)
-    out = still.at[0, 0].set(0.02)  # twice that passes pixel 199, 0.175 m
+    out = still.at[0, 0].set(0.03)  # that passes pixel 199, 0.175 m
     assert not candidates.stays_inside(centers, area, out)
     assert candidates.stays_inside(centers, area.at[0].set(0.0), out), "an object out of sight does not count"
     assert candidates.stays_inside(centers.at[0, 0].set(0.2), area, out.at[0, 0].set(-0.01)), "moving inward is fine"

@@ -49,8 +49,9 @@ def seen(settled: Any) -> Observation:
     return render.render(structs.take(settled.scene, 0), settled.poses[0])
 
 
-def _decide(seen: Observation, predictor: Any, scorer: Any, **options: Any) -> Any:
-    return planner.decide(jax.random.key(0), seen, predictor, scorer, count=COUNT, slots=SLOTS, distance=0.1, **options)
+def _decide(seen: Observation, predictor: Any, scorer: Any, **rule: Any) -> Any:
+    options = {"count": COUNT, "slots": SLOTS, "distance": 0.1, "rule": planner.Rule(**rule)}
+    return planner.decide(jax.random.key(0), seen, predictor, scorer, **options)
 
 
 def test_a_sure_grasp_is_taken_at_once(seen: Observation) -> None:

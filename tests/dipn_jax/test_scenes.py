@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from dipn_jax import scenes, shapes
+from dipn_jax import cases, scenes, shapes
 from dipn_jax.errors import UserError
 
 CONFIG = scenes.fixed_count(5)
@@ -34,15 +34,15 @@ def test_counts_follow_the_config() -> None:
 
 
 def test_hard_cases_load_as_placed() -> None:
-    names, scene, poses = scenes.load_cases(scenes.hard_cases_path())
+    names, scene, poses = cases.load_cases(cases.hard_cases_path())
     assert len(names) == 10 and scene.shape.shape == (10, 6)
-    raw = json.loads(scenes.hard_cases_path().read_text())["cases"][0]["objects"][0]
+    raw = json.loads(cases.hard_cases_path().read_text())["cases"][0]["objects"][0]
     np.testing.assert_allclose(poses[0, 0, :2], raw["position_m"], atol=1e-6)
     assert ((scene.shape >= 0).sum(-1) >= 3).all()
 
 
 def test_removed_objects_are_absent_and_parked() -> None:
-    _, scene, poses = scenes.load_cases(scenes.hard_cases_path())
+    _, scene, poses = cases.load_cases(cases.hard_cases_path())
     gone = np.zeros(6, bool)
     gone[1] = True
     after, moved = scenes.remove(jax.tree.map(lambda leaf: leaf[0], scene), poses[0], gone)
@@ -73,7 +73,7 @@ def _file(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
 )
 def test_a_wrong_case_file_is_named(tmp_path: pathlib.Path, changes: dict[str, Any], says: str) -> None:
     with pytest.raises(UserError, match=says):
-        scenes.load_cases(_file(tmp_path, **changes))
+        cases.load_cases(_file(tmp_path, **changes))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_file_that_is_no_case_file_is_named(tmp_path: pathlib.Path, text: str)
     path = tmp_path / "cases.json"
     path.write_text(text)
     with pytest.raises(UserError, match="case file"):
-        scenes.load_cases(path)
+        cases.load_cases(path)
 
 
 @pytest.mark.parametrize("text", ["0", "31", "7:1", "many", "1:x", "-3"])

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint, clutter, policy, scenes
+from dipn_jax import cases, checkpoint, clutter, policy, scenes
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.resume import Partial
 from dipn_jax.structs import Push
-from eval import clearing, film, grasping, instances, metrics, prediction, report
+from eval import clearing, deciding, film, grasping, instances, metrics, prediction, report
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
@@ -143,27 +143,28 @@ def test_labels_of_pretraining_mostly_say_what_physics_says(engine: Any) -> None
 def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Two hard cases acted on by networks that know nothing: one by grasps, one by pushes."""
     out = tmp_path_factory.mktemp("clear")
-    predictor, scorer = policy.load_predictor(runs["dipn"], 6), policy.load_scorer(runs["grasp"])
+    nets = deciding.Nets(push=runs["dipn"], grasp=runs["grasp"])
 
     def table(name: str) -> list[instances.Instance]:
-        return instances.hard_instances(engine, scenes.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
+        return instances.hard_instances(engine, cases.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
 
-    grasps = clearing.ClearConfig(candidates=4, threshold=0.0)
-    grasped = clearing.clear(table("06"), engine, predictor, scorer, grasps, Partial(out, {"case": "06"}), seed=0)
-    tables, config = table("10"), clearing.ClearConfig(candidates=4, threshold=2.0, gamma=1.05)
+    grasps = deciding.load(deciding.Plan(candidates=4, threshold=0.0), nets, engine, slots=6)
+    grasped = clearing.clear(table("06"), engine, grasps, Partial(out, {"case": "06"}), seed=0)
+    tables = table("10")
+    decide = deciding.load(deciding.Plan(candidates=4, threshold=2.0, gamma=1.05), nets, engine, slots=6)
     # interrupted after the second turn, then taken up by a fresh call
     partial = Partial(out, {})
     save = partial.save
 
     def stop_at_two(state: Any) -> None:
         save(state)
-        if state[0] == 2:
+        if state[0].actions == 2:
             raise KeyboardInterrupt
 
     partial.save = stop_at_two  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
-        clearing.clear(copy.deepcopy(tables), engine, predictor, scorer, config, partial, seed=0)
-    tables = clearing.clear(tables, engine, predictor, scorer, config, Partial(out, {}), seed=0)
+        clearing.clear(copy.deepcopy(tables), engine, decide, partial, seed=0)
+    tables = clearing.clear(tables, engine, decide, Partial(out, {}), seed=0)
     assert Partial(out, {"other": 1}).load("fresh") == "fresh"
     tables = grasped + tables
     clearing.save(tables, out)

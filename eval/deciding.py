@@ -1,0 +1,311 @@
+"""Push or grasp: every compared method, on many tables in one call."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import candidates, checkpoint, clutter, geometry, planner, policy, primitives, render, scenes, structs
+from dipn_jax.errors import UserError
+from dipn_jax.networks import vpg
+from dipn_jax.physics import Engine
+from dipn_jax.planner import Proposal, Rule
+from dipn_jax.structs import Array, Decision, Grasp, Observation, Push, Pytree, Scene
+
+MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
+LONGEST = 0.12
+"""Metres of a push at most."""
+CAUTION = {"vpg": 1.0, "dqn+gn": 1.0}
+"""How many times the best grasp's value a push must be worth."""
+
+
+WANTED = {
+    "dipn+gn": ("push", "grasp"),
+    "rea+dipn": ("push", "value"),
+    "dqn+gn": ("value", "grasp"),
+    "vpg": ("value",),
+    "gn": ("grasp",),
+    "physics+gn": ("grasp",),
+}
+"""The networks that each method decides with."""
+NETWORKS = {"push": "dipn", "grasp": "grasp", "value": "vpg"}
+COMMANDS = {"push": "push", "grasp": "grasp", "value": "baseline"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How to decide."""
+
+    method: MethodName = "dipn+gn"
+    candidates: int = 32
+    distances: tuple[float, ...] = (0.10,)  # metres a push goes; of several, candidates take them in turn
+    gamma: float = 0.9
+    threshold: float = 0.7
+    released: bool = False  # with the clauses of DIPN's released code
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(MethodName):
+            raise UserError(f"--method {self.method}: want one of {', '.join(get_args(MethodName))}")
+
+    def rule(self) -> Rule:
+        """What the planner compares by."""
+        rule = planner.RELEASED if self.released else Rule()
+        result: Rule = rule.replace(gamma=self.gamma, threshold=self.threshold)
+        return result
+
+    def longest(self) -> float:
+        """Metres."""
+        return max(self.distances)
+
+
+@dataclasses.dataclass(frozen=True)
+class Nets:
+    """Runs that a method decides with."""
+
+    push: pathlib.Path | None = None  # dipn-train push
+    grasp: pathlib.Path | None = None  # dipn-train grasp
+    value: pathlib.Path | None = None  # dipn-train baseline
+
+    def require(self, method: str) -> dict[str, pathlib.Path]:
+        """The runs that `method` needs, by name.
+
+        Raises:
+          UserError: one was not given.
+        """
+        for name in WANTED[method]:
+            if getattr(self, name) is None:
+                raise UserError(f"--method {method}: wants --{name}-net; give a run of dipn-train {COMMANDS[name]}")
+        return {name: checkpoint.find(getattr(self, name), network=NETWORKS[name]) for name in WANTED[method]}
+
+
+@flax.struct.dataclass
+class Choice(Pytree):
+    """What was chosen for one table, and what it was chosen by."""
+
+    is_push: Array  # [] bool
+    push: Push  # the best one
+    grasp: Grasp  # the best one
+    grasp_pixel: Array  # [3] int32: rotation, row, col of it
+    values: Array  # [3] its score; mean score now (or its value); gamma times the mean after the push (or its value)
+    motion: Array  # [N, 3] dx, dy (metres), dtheta (radians) predicted for the push
+
+
+Decide = Callable[[jax.Array, Observation, jax.Array, Rule], Decision]
+"""(key, observation, distances [P] metres, rule) -> decision; jitted, one table."""
+Decider = Callable[[jax.Array, Scene, Array], Choice]
+"""(keys [B], scenes [B, N], poses [B, N, 7]) -> choices [B], numpy."""
+
+
+def load(plan: Plan, nets: Nets, engine: Engine, *, slots: int) -> Decider:
+    """The decider of a method.
+
+    Args:
+      plan: method and rule.
+      nets: runs.
+      engine: physics, for `physics+gn`.
+      slots: N.
+
+    Raises:
+      UserError: a network that the method needs was not given, or is another.
+    """
+    runs = nets.require(plan.method)
+    distances = np.resize(np.asarray(plan.distances, np.float32), plan.candidates)
+    if plan.method == "physics+gn":
+        scorer, appraise = policy.load_scorer(runs["grasp"]), policy.load_appraiser(runs["grasp"])
+        return functools.partial(_rolled_out, scorer, appraise, engine, plan.rule(), distances)
+    if plan.method == "gn":
+        return best_grasp(policy.load_scorer(runs["grasp"]), slots=slots)
+    decide = _decide(plan, runs, slots)
+    return functools.partial(_in_lockstep, decide, plan.rule(), distances)
+
+
+def best_grasp(scorer: planner.Scorer, *, slots: int) -> Decider:
+    """The decider that grasps where `scorer` scores highest, and never pushes."""
+    predictor = policy.static_predictor(slots)
+
+    def decide(key: jax.Array, seen: Observation, distances: jax.Array, rule: Rule) -> Decision:
+        options: dict[str, Any] = {"count": len(distances), "slots": slots, "distance": distances, "rule": rule}
+        return planner.decide(key, seen, predictor, scorer, **options)
+
+    return functools.partial(_in_lockstep, decide, Rule(threshold=-1.0), np.array([0.1], np.float32))
+
+
+def _decide(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
+    """One table's decision as a function of key, observation, distances and rule."""
+    if plan.method in CAUTION:
+        return _compare(plan, runs, slots)
+    predictor = policy.load_predictor(runs["push"], slots)
+    if plan.method == "rea+dipn":
+        scorer, appraise = _part(runs["value"], "grasp"), policy.load_appraiser(runs["value"], network="vpg")
+    else:
+        scorer, appraise = policy.load_scorer(runs["grasp"]), policy.load_appraiser(runs["grasp"])
+
+    def imagine(key: jax.Array, seen: Observation, distances: jax.Array, rule: Rule) -> Decision:
+        options: dict[str, Any] = {"count": plan.candidates, "slots": slots, "distance": distances, "rule": rule}
+        return planner.decide(key, seen, predictor, scorer, appraise=appraise, **options)
+
+    return imagine
+
+
+def _compare(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
+    """As `_decide`, of a method that imagines nothing."""
+    pushes = _part(runs["value"], "push")
+    with_gn = plan.method == "dqn+gn"
+    scorer = policy.load_scorer(runs["grasp"]) if with_gn else _part(runs["value"], "grasp")
+
+    def compare(_: jax.Array, seen: Observation, distances: jax.Array, rule: Rule) -> Decision:
+        caution, threshold = CAUTION[plan.method], rule.threshold if with_gn else jnp.inf
+        options: dict[str, Any] = {"slots": slots, "distance": distances[0]}
+        return planner.compare(seen, pushes, scorer, caution=caution, threshold=threshold, **options)
+
+    return compare
+
+
+def _part(run: pathlib.Path, name: str) -> planner.Scorer:
+    """The scorer of pushes or of grasps of a baseline.
+
+    Raises:
+      UserError: it was trained without.
+    """
+    found = policy.load_values(run)[vpg.PARTS.index(name)]
+    if found is None:
+        raise UserError(
+            f"--value-net {run}: has not learnt to {name}; give a run of another dipn-train baseline --method"
+        )
+    return found
+
+
+def _in_lockstep(
+    decide: Decide, rule: Rule, distances: np.ndarray, keys: jax.Array, scene: Scene, poses: Array
+) -> Choice:
+    """`decide` on all tables `[B]`."""
+    choose: Choice = clutter.in_few(
+        functools.partial(_choices, decide=decide, rule=rule, distances=distances), keys, scene, poses
+    )
+    return choose
+
+
+@functools.partial(jax.jit, static_argnames="decide")
+def _choices(
+    keys: jax.Array,
+    scene: Scene,
+    poses: jax.Array,
+    real: jax.Array,
+    *,
+    decide: Decide,
+    rule: Rule,
+    distances: jax.Array,
+) -> Choice:
+    """Choices of the tables that are real, one after another: a decision is itself a batch of images."""
+
+    def one(key: jax.Array, scene: Scene, poses: jax.Array) -> Choice:
+        seen = render.render(scene, poses)
+        return _choice(seen, decide(key, seen, distances, rule))
+
+    def some(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Choice:
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, *args[:3]))
+        return jax.lax.cond(args[3], lambda: one(*args[:3]), lambda: nothing)
+
+    return jax.lax.map(some, (keys, scene, poses, real))
+
+
+def _choice(seen: Observation, decision: Decision) -> Choice:
+    return Choice(
+        is_push=decision.is_push,
+        push=decision.push,
+        grasp=candidates.grasp_at(decision.grasp_pixel, seen.height),
+        grasp_pixel=decision.grasp_pixel,
+        values=jnp.stack([decision.grasp_score, decision.value_now, decision.value_push]),
+        motion=decision.motion,
+    )
+
+
+def _rolled_out(
+    scorer: planner.Scorer,
+    appraise: planner.Appraiser,
+    engine: Engine,
+    rule: Rule,
+    distances: np.ndarray,
+    keys: jax.Array,
+    scene: Scene,
+    poses: Array,
+) -> Choice:
+    """As `_in_lockstep`, but the engine itself says what pushes do, with masses and frictions that nobody can see."""
+    propose = functools.partial(_proposals, scorer=scorer, rule=rule, distances=distances)
+    proposals = clutter.in_few(propose, keys, scene, poses)
+    motion = _motions(engine, scene, poses, proposals, float(max(distances)))
+    choose = functools.partial(_chosen, appraise=appraise, rule=rule)
+    chosen: Choice = clutter.in_few(choose, scene, poses, proposals, motion)
+    return chosen
+
+
+@functools.partial(jax.jit, static_argnames="scorer")
+def _proposals(
+    keys: jax.Array,
+    scene: Scene,
+    poses: jax.Array,
+    real: jax.Array,
+    *,
+    scorer: planner.Scorer,
+    rule: Rule,
+    distances: jax.Array,
+) -> Proposal:
+    def one(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Proposal:
+        key, scene, poses, wanted = args
+        slots, seen = scene.shape.shape[0], render.render(scene, poses)
+        found = planner.propose(key, seen, scorer, rule, count=len(distances), slots=slots, distance=distances)
+        return found.replace(settled=found.settled | ~wanted)
+
+    return jax.lax.map(one, (keys, scene, poses, real))
+
+
+def _motions(engine: Engine, scene: Scene, poses: Array, proposals: Proposal, longest: float) -> np.ndarray:
+    """Motions `[B, P, N, 3]` of the pushes that matter, as the engine with nominal masses and frictions has them."""
+    asked = proposals.feasible & ~proposals.settled[:, None]
+    table, which = np.nonzero(asked)
+    motion = np.zeros((*asked.shape, scene.shape.shape[1], 3), np.float32)
+    guess = scenes.nominal(scene)
+    centers = np.asarray(clutter.in_chunks(_centers, guess, poses))
+    for begin in range(0, len(table), engine.batch):
+        rows, push = table[begin : begin + engine.batch], which[begin : begin + engine.batch]
+        pushes = jax.tree.map(lambda leaf, r=rows, p=push: leaf[r, p], proposals.pushes)
+        rollout = primitives.push(engine, structs.take(guess, rows), poses[rows], pushes, longest=longest)
+        after = np.asarray(rollout.poses)[:, -1]
+        motion[rows, push] = geometry.planar_motion(poses[rows], after, centers[rows])
+    return motion
+
+
+@jax.jit
+def _centers(scene: Scene, poses: jax.Array) -> jax.Array:
+    def one(pair: tuple[Scene, jax.Array]) -> jax.Array:
+        return candidates.mask_centers(render.render(*pair).label, pair[1].shape[0])[0]
+
+    return jax.lax.map(one, (scene, poses))
+
+
+@functools.partial(jax.jit, static_argnames="appraise")
+def _chosen(
+    scene: Scene,
+    poses: jax.Array,
+    proposals: Proposal,
+    motion: jax.Array,
+    real: jax.Array,
+    *,
+    appraise: planner.Appraiser,
+    rule: Rule,
+) -> Choice:
+    def one(args: tuple[Scene, jax.Array, Proposal, jax.Array, jax.Array]) -> Choice:
+        scene, poses, proposal, motion, wanted = args
+        seen = render.render(scene, poses)
+        proposal = proposal.replace(settled=proposal.settled | ~wanted)
+        return _choice(seen, planner.choose(seen, proposal, motion, appraise, rule))
+
+    return jax.lax.map(one, (scene, poses, proposals, motion, real))

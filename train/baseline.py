@@ -1,0 +1,218 @@
+"""The compared methods learn while they act: values or chances of pushes and grasps.
+
+VPG and REA: Zeng et al., IROS 2018. DQN+GN: Huang et al., ICRA 2021, its push reward from their released code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import pathlib
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+
+from dipn_jax import (
+    checkpoint,
+    console,
+    files,
+    losses,
+    resume,
+    structs,
+)
+from dipn_jax.errors import UserError
+from dipn_jax.networks.vpg import VpgConfig
+from dipn_jax.physics import Engine
+from dipn_jax.planner import Scorer
+from dipn_jax.scenes import SceneConfig
+from dipn_jax.structs import Grasp, GraspEpisode
+from train import acting, tables
+from train.acting import Look
+from train.grasp import PHASE, WINDOWS, Window, view, windows
+from train.loop import make_step
+
+MethodName = Literal["vpg", "rea", "dqn"]
+PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
+"""What each method learns: REA+DIPN uses REA's grasps only, DQN+GN has GN for its grasps."""
+DISCOUNT = 0.5
+"""VPG's discount of what comes next."""
+RECENT = 100
+"""Actions over which the success of the moment is counted."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BaselineConfig:
+    """How to learn."""
+
+    method: MethodName = "vpg"
+    actions: int = 2500
+    tables: int = 10
+    updates: int = 10  # optimizer steps after each round of one action a table
+    batch: int = 32
+    learning_rate: float = 5e-4
+    weight_decay: float = 1e-4
+    seed: int = 0
+    distance: float = 0.10  # metres of a push
+
+
+@dataclasses.dataclass
+class State:
+    """Everything that a run is at a moment."""
+
+    params: Any
+    moments: Any
+    tables: tables.Tables
+    round: int = 0
+    seen: dict[str, list[Window]] = dataclasses.field(default_factory=lambda: {"push": [], "grasp": []})
+    did: list[tuple[str, float]] = dataclasses.field(default_factory=list)  # primitive and reward of each action
+
+
+class _Outcomes:
+    """What `make_step` wants to know of a task: one batch of windows for each part of the network."""
+
+    def __init__(self, answers: str) -> None:
+        self.answers = answers
+
+    def loss(self, model: nnx.Module, batch: dict[str, Window], key: jax.Array) -> jax.Array:
+        """Huber loss of values, or cross entropy of chances, at executed pixels; as published, nothing is mirrored."""
+        total = jnp.zeros(())
+        for name, some in batch.items():
+            images, pixel = view(some, jax.random.randint(key, (len(some.target), 2), 0, 2 * PHASE))
+            out = getattr(model, name)(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
+            if self.answers == "chance":
+                total += losses.score_loss(out, some.target, jnp.ones(len(images)))
+            else:
+                total += losses.smooth_l1(out - some.target).mean()
+        return total
+
+
+def learn(
+    engine: Engine, scenes: SceneConfig, config: BaselineConfig, out: pathlib.Path, *, scorer: Scorer | None = None
+) -> dict[str, float]:
+    """Learn in the folder `out`; a run that was interrupted goes on.
+
+    Args:
+      engine: physics.
+      scenes: what tables are made of.
+      config: how.
+      out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
+      scorer: GN, whose grasps `dqn` takes.
+
+    Returns:
+      Mean reward of all and of the last pushes and grasps.
+
+    Raises:
+      UserError: the folder holds another run, or there is no scorer for `dqn`.
+    """
+    if (config.method == "dqn") != (scorer is not None):
+        raise UserError(
+            f"baseline: --method {config.method} takes {'a' if config.method == 'dqn' else 'no'} --grasp-net"
+        )
+    network = VpgConfig(parts=PARTS[config.method], answers="chance" if config.method == "rea" else "value")
+    model: Any = checkpoint.build("vpg", network, seed=config.seed)
+    identity = {**dataclasses.asdict(config), "scenes": str(scenes), "engine": type(engine).__name__}
+    files.claim(out, identity)
+    ended = checkpoint.newest(out)
+    if ended:
+        return {name: value for name, value in ended[1].items() if name.startswith("reward/")}
+    partial = resume.Partial(out, identity)
+    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
+    )
+    step = make_step(_Outcomes(network.answers), graph, optimizer)
+    state: State | None = partial.load(None)
+    if state is None:
+        fresh = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
+        params = jax.device_get(params)
+        state = State(params, jax.device_get(optimizer.init(params)), fresh)
+    total = -(-config.actions // config.tables)
+    with console.Progress(f"act and learn {config.method}", total, unit="rounds", done=state.round) as progress:
+        while state.round < total:
+            look = functools.partial(acting.look, graph, state.params, rest, scorer=scorer, distance=config.distance)
+            _act(state, look, engine, scenes, config)
+            state.params, state.moments = _update(state, step, rest, config)
+            state.round += 1
+            partial.save(state)
+            _log(out, state, config)
+            progress.advance(1, ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT).items()))
+    _log(out, state, config)  # again, should the last round have been cut short before it
+    nnx.update(model, jax.tree.map(jnp.asarray, state.params))
+    result = _rewards(state.did, len(state.did)) | {f"{k}/recent": v for k, v in _rewards(state.did, RECENT).items()}
+    extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
+    checkpoint.save(out, len(state.did), {"model": nnx.state(model)}, network="vpg", config=network, extra=extra)
+    partial.finish()
+    return result
+
+
+def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneConfig, config: BaselineConfig) -> None:
+    """One action on every table, what came of it, and what it teaches."""
+    count, before = config.tables, state.tables
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.round), (2, count))
+    now: Look = jax.device_get(look(keys[0], before.scene, before.poses))
+    rng = np.random.default_rng([config.seed, state.round])
+    pushing, push, grasp = acting.choose(now, rng, len(state.did), may_push="push" in PARTS[config.method])
+    scene, poses, held, good = acting.execute(engine, before.scene, before.poses, pushing, push, grasp)
+    then: Look = jax.device_get(look(keys[1], scene, poses))
+    changed = acting.changed(now, then)
+    success = held.any(1)
+    effect = np.where(pushing, changed, success)
+    reward = np.where(pushing, acting.push_reward(now, then, method=config.method), success.astype(float))
+    target = reward
+    if config.method == "vpg":
+        future = np.maximum(then.push_value, then.grasp_value)
+        left = (scene.shape >= 0).any(1) & effect & np.isfinite(future)
+        target = reward + DISCOUNT * np.where(left, future, 0.0)
+    for name, rows, centre, angle in (
+        ("push", pushing & good, push.start, push.angle),
+        ("grasp", ~pushing & good, grasp.center, grasp.angle),
+    ):
+        if name in PARTS[config.method] and rows.any():
+            aim = Grasp(centre, angle, np.zeros(count, np.float32))
+            tried = GraspEpisode(
+                before.scene, before.poses, poses, aim, held, target.astype(np.float32), np.zeros(count, int)
+            )
+            taught = windows(structs.take(tried, rows), pixels=WINDOWS["compact"] + 2 * PHASE)
+            state.seen[name].append(taught)
+    state.did += [("push" if pushing[i] else "grasp", float(reward[i])) for i in np.flatnonzero(good)]
+    state.tables.step(scene, poses, effect, good, engine, scenes)
+
+
+def _update(state: State, step: Callable[..., Any], rest: Any, config: BaselineConfig) -> tuple[Any, Any]:
+    """Some optimizer steps on everything tried so far."""
+    parts = PARTS[config.method]
+    if not all(state.seen[name] for name in parts):
+        return state.params, state.moments
+    seen = {name: structs.concatenate(state.seen[name]) for name in parts}
+    rng = np.random.default_rng([config.seed, state.round, 1])
+    key = jax.random.fold_in(jax.random.key(config.seed + 1), state.round)
+    params, moments = jax.tree.map(jnp.array, (state.params, state.moments))
+    for k in range(config.updates):
+        batch = {n: structs.take(some, rng.integers(len(some.target), size=config.batch)) for n, some in seen.items()}
+        again = jax.tree.map(jnp.array, rest)
+        params, rest, moments, _ = step(params, again, moments, batch, jax.random.fold_in(key, k))
+    return jax.device_get((params, moments))
+
+
+def _rewards(did: list[tuple[str, float]], last: int) -> dict[str, float]:
+    """Mean reward of the `last` actions, by primitive."""
+    recent = did[-last:]
+    result = {}
+    for name in ("push", "grasp"):
+        values = [reward for what, reward in recent if what == name]
+        if values:
+            result[f"reward/{name}"] = float(np.mean(values))
+    return result
+
+
+def _log(out: pathlib.Path, state: State, config: BaselineConfig) -> None:
+    """`metrics.jsonl`: after so many actions, the mean rewards of the last ones."""
+    counts = range(config.tables, len(state.did) + 1, config.tables)
+    rows = [{"step": n, **_rewards(state.did[:n], RECENT)} for n in counts]
+    files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())

@@ -1,0 +1,77 @@
+"""Tables that a learner acts on side by side; those that are done with are set anew."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+
+from dipn_jax import clutter, structs
+from dipn_jax.physics import Engine
+from dipn_jax.scenes import SceneConfig
+from dipn_jax.structs import Scene, SettledScene
+from dipn_jax.workspace import WORKSPACE
+
+PATIENCE = 3
+"""Actions without effect in a row before a table is set anew."""
+
+
+@dataclasses.dataclass
+class Tables:
+    """T tables; everything about them that an interrupted run has to keep."""
+
+    scene: Scene  # [T, N], numpy
+    poses: np.ndarray  # [T, N, 7]
+    spare: SettledScene  # tables to come
+    seed: int
+    drawn: int = 1  # batches of tables that were drawn
+    idle: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))  # [T] actions without effect
+
+    def step(
+        self, scene: Scene, poses: np.ndarray, effect: np.ndarray, good: np.ndarray, engine: Engine, config: SceneConfig
+    ) -> np.ndarray:
+        """Go on from what an action left; tables that went wrong, are empty, spilt or stuck are set anew.
+
+        Args:
+          scene: `[T, N]` afterwards.
+          poses: `[T, N, 7]` afterwards.
+          effect: `[T]` bool: the action did something.
+          good: `[T]` bool: its simulation can be believed.
+          engine: physics, for more tables.
+          config: what they are made of.
+
+        Returns:
+          Which were set anew `[T]` bool.
+        """
+        idle = np.where(effect, 0, self.idle + 1)
+        outside = ((np.abs(poses[..., :2]) > WORKSPACE.half).any(-1) & (scene.shape >= 0)).any(1)
+        again = ~good | outside | (idle >= PATIENCE) | ~(scene.shape >= 0).any(1)
+        over = np.flatnonzero(again)
+        while len(self.spare.fault) < len(over):
+            self.spare = structs.concatenate([self.spare, _draw(engine, config, self.seed, self.drawn, len(good))])
+            self.drawn += 1
+        fresh, self.spare = (structs.take(self.spare, part) for part in (slice(0, len(over)), slice(len(over), None)))
+        self.poses = _replaced(over, poses, fresh.poses)
+        self.scene = jax.tree.map(functools.partial(_replaced, over), scene, fresh.scene)
+        self.idle = np.where(again, 0, idle)
+        return again
+
+
+def begin(engine: Engine, config: SceneConfig, *, count: int, seed: int) -> Tables:
+    """`count` fresh tables."""
+    drawn = _draw(engine, config, seed, 0, count)
+    first, spare = structs.take(drawn, slice(0, count)), structs.take(drawn, slice(count, None))
+    return Tables(first.scene, first.poses, spare, seed, idle=np.zeros(count, int))
+
+
+def _draw(engine: Engine, config: SceneConfig, seed: int, batch: int, count: int) -> SettledScene:
+    """Twice as many tables as are in play."""
+    return clutter.settled_exactly(jax.random.fold_in(jax.random.key(seed), batch), engine, config, 2 * count)
+
+
+def _replaced(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    result = np.array(old)
+    result[where] = new
+    return result
