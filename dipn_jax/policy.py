@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -133,20 +133,20 @@ def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
     """Scorers of pushes and of grasps; None where the network has no such part."""
     squash = nnx.sigmoid if model.config.answers == "chance" else (lambda x: x)
 
-    def scorer(part: nnx.Module, mirrored: bool) -> Scorer:
+    def scorer(part: nnx.Module, action: Literal["push", "grasp"]) -> Scorer:
         thaw = _frozen(part)
 
         def score(images: jax.Array) -> jax.Array:
             network = thaw()
-            one = functools.partial(grasp.score_image, network, mirrored=mirrored, squash=squash)  # type: ignore[arg-type]
+            one = functools.partial(grasp.score_image, network, action=action, squash=squash)  # type: ignore[arg-type]
             return jax.lax.map(one, images)
 
         return score
 
     parts = model.config.parts
     return (
-        scorer(model.push, mirrored=False) if "push" in parts else None,
-        scorer(model.grasp, mirrored=True) if "grasp" in parts else None,
+        scorer(model.push, "push") if "push" in parts else None,
+        scorer(model.grasp, "grasp") if "grasp" in parts else None,
     )
 
 

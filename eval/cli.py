@@ -10,15 +10,13 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from dipn_jax import cases as case_files
 from dipn_jax import checkpoint, console, files, policy, resume, scenes
 from dipn_jax.errors import UserError
-from dipn_jax.physics import Engine, EngineName, make_engine
+from dipn_jax.physics import EngineName, make_engine
 from eval import clearing, deciding, grasp_curve, grasping, metrics, prediction
 from eval import curve as curves
-from eval import instances as tables_to_clear
 from eval import report as reporting
-from eval.instances import Instance
+from eval.instances import Instance, Tables
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
@@ -165,45 +163,6 @@ def grasp(
         out.mkdir(parents=True, exist_ok=True)
         grasp_curve.figure(values).savefig(out / "curve.png", dpi=130)
     _finish(out, values, settings, partial)
-
-
-@dataclasses.dataclass(frozen=True)
-class Tables:
-    """Which tables are cleared."""
-
-    cases: str = "hard"
-    """hard (the ten hand-placed instances), random, or a case file of your own."""
-    names: tuple[str, ...] = ()
-    """Only these cases of the file."""
-    objects: Objects = "10"
-    """Number of objects (random)."""
-    instances: int = 1
-    """Tables (random), or repeats of each case with perturbed physics."""
-
-    def __post_init__(self) -> None:
-        console.require_positive(instances=self.instances)
-
-    def path(self) -> pathlib.Path | None:
-        """The case file, if there is one."""
-        if self.cases == "random":
-            return None
-        return case_files.hard_cases_path() if self.cases == "hard" else pathlib.Path(self.cases)
-
-    def slots(self) -> int:
-        """Most objects on one of them."""
-        path = self.path()
-        if path is None:
-            return scenes.parse_objects(self.objects).slots
-        return int(case_files.load_cases(path)[1].shape.shape[1])
-
-    def make(self, engine: Engine, *, seed: int) -> list[Instance]:
-        """All of them, at rest."""
-        path = self.path()
-        if path is None:
-            config = scenes.parse_objects(self.objects)
-            return tables_to_clear.random_instances(engine, config, count=self.instances, seed=seed)
-        options: dict[str, Any] = {"slots": self.slots(), "repeats": self.instances, "seed": seed}
-        return tables_to_clear.hard_instances(engine, path, list(self.names) or None, **options)
 
 
 DEFAULT_TABLES = Tables()

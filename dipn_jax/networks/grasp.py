@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,8 @@ MIN_DEPTH = 0.002
 """Metres of object that must be between the fingers; objects 25 mm high lie 5 mm over the lowest fingertip."""
 SCALE = (0.5, 0.5, 0.5, 0.05)
 """What red, green, blue (in [0, 1]) and height (metres) are divided by."""
+EMPTY = 0.005
+"""Metres above the table up to which a pixel shows none of an object: no grasp is centred there, and none is learnt."""
 BLOCK = 4
 """Pixels a side of a cell: the compact network works on cells."""
 FINGER_COLUMNS = tuple(
@@ -129,31 +131,33 @@ def score_image(
     network: GraspNet,
     image: jax.Array,
     *,
-    mirrored: bool = True,
+    action: Literal["grasp", "push"] = "grasp",
     squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
 ) -> jax.Array:
-    """All grasps of one image.
+    """All grasps of one image, or all pushes.
 
     Args:
       network: GN, or another of its kind, in evaluation mode.
       image: `[224, 224, 4]`.
-      mirrored: the gripper is its own mirror image, a grasp turned by half a turn the same grasp, so the `compact`
-        network is asked for half of the rotations. Not so a push.
+      action: the gripper is its own mirror image, a grasp turned by half a turn the same grasp, so the `compact`
+        network is asked for half of the rotations; and a grasp centred on empty table scores nothing. Not so a push.
       squash: from the network's outputs to scores.
 
     Returns:
       Scores `[16, 224, 224]` in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
     """
     if network.config.preset == "compact":
-        turns = ROTATIONS // 2 if mirrored else ROTATIONS
+        turns = ROTATIONS // 2 if action == "grasp" else ROTATIONS
         _, back = turning_tables(turns)
         scores = squash(score_cells(network, image, turns)).reshape(-1)[back]
-        return jnp.tile(scores, (ROTATIONS // turns, 1, 1))
-    angles = jnp.asarray(grasp_angles())
-    table = jnp.array([*render.TABLE_COLOR, 0.0])
-    views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, VIEW) + table)(angles)
-    scores = squash(network(views))
-    return jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
+        scores = jnp.tile(scores, (ROTATIONS // turns, 1, 1))
+    else:
+        angles = jnp.asarray(grasp_angles())
+        table = jnp.array([*render.TABLE_COLOR, 0.0])
+        views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, VIEW) + table)(angles)
+        scores = squash(network(views))
+        scores = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
+    return jnp.where(image[..., 3] > EMPTY, scores, 0.0) if action == "grasp" else scores
 
 
 def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:

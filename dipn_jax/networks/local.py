@@ -17,7 +17,17 @@ import numpy as np
 from flax import nnx
 
 from dipn_jax import geometry
-from dipn_jax.networks.grasp import BLOCK, VIEW, GraspNet, flat_pixels, score_cells, score_image, turning_tables
+from dipn_jax.networks.grasp import (
+    BLOCK,
+    EMPTY,
+    SCALE,
+    VIEW,
+    GraspNet,
+    flat_pixels,
+    score_cells,
+    score_image,
+    turning_tables,
+)
 from dipn_jax.workspace import ROTATIONS
 
 FINALISTS = 8
@@ -62,10 +72,16 @@ def _felt(cells: jax.Array, least: jax.Array, extent: jax.Array, axis: int) -> j
     return (cells >= low // BLOCK) & (cells <= high // BLOCK)
 
 
+def _scores(logits: jax.Array, height: jax.Array) -> jax.Array:
+    """Scores of pixels of normalized `height`; 0 on the table."""
+    return jnp.where(height * SCALE[3] > EMPTY, nnx.sigmoid(logits), 0.0)
+
+
 def rough_means(network: GraspNet, now: jax.Array, images: jax.Array, wanted: jax.Array) -> jax.Array:
     """About the mean of all scores on each image `[P]`, less that on `now`; arguments as of `appraise`."""
     weight, there = _weights(), turning_tables(ROTATIONS // 2)[0][np.array(TURNS)]
-    before = nnx.sigmoid(score_cells(network, now, ROTATIONS // 2)[np.array(TURNS)])
+    heights = (flat_pixels(now)[there])[..., 3]
+    before = _scores(score_cells(network, now, ROTATIONS // 2)[np.array(TURNS)], heights)
     cells = network.body.cells  # type: ignore[union-attr]
 
     def again(rows: int, image: jax.Array, least: jax.Array, extent: jax.Array) -> jax.Array:
@@ -79,7 +95,7 @@ def rough_means(network: GraspNet, now: jax.Array, images: jax.Array, wanted: ja
             return jax.vmap(part)(jnp.asarray(stack), at)
 
         pixels = flat_pixels(image)[cut(there)]
-        fresh = nnx.sigmoid(cells(pixels.reshape(*pixels.shape[:3], -1)))
+        fresh = _scores(cells(pixels.reshape(*pixels.shape[:3], -1)), pixels[..., 3])
         cols, lines = (_felt(at[:, i, None] + np.arange(shape[i]), least, extent, i) for i in range(2))
         inside = (lines[:, :, None] & cols[:, None, :])[..., None]
         return jnp.where(inside, cut(weight) * (fresh - cut(before)), 0.0).sum()
