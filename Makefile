@@ -26,7 +26,7 @@ demo: setup
 	$(BIN)/dipn-eval grasp --grasp-net $(DEMO)/runs/gn --scenes 40 --out $(DEMO)/eval/grasp
 	$(BIN)/dipn-eval clear --push-net $(DEMO)/runs/dipn --grasp-net $(DEMO)/runs/gn --cases hard --candidates 16 --out $(DEMO)/eval/hard
 	$(BIN)/dipn-eval clear --push-net $(DEMO)/runs/dipn --grasp-net $(DEMO)/runs/gn --cases random --objects 10 --instances 6 --candidates 16 --out $(DEMO)/eval/random
-	$(BIN)/dipn-eval report --prediction $(DEMO)/eval/prediction --grasp $(DEMO)/eval/grasp --hard $(DEMO)/eval/hard --random $(DEMO)/eval/random --runs $(DEMO)/runs/dipn $(DEMO)/runs/gn-pretrained $(DEMO)/runs/gn --out $(DEMO)
+	$(BIN)/dipn-eval report --prediction $(DEMO)/eval/prediction --grasp $(DEMO)/eval/grasp --clear $(DEMO)/eval/hard $(DEMO)/eval/random --runs $(DEMO)/runs/dipn $(DEMO)/runs/gn-pretrained $(DEMO)/runs/gn --out $(DEMO)
 
 test: setup lint
 	$(BIN)/python -m pytest

@@ -81,6 +81,10 @@ class SceneConfig:
             raise UserError(f"scene config: counts {self.counts} are not probabilities; want non-negative, sum > 0")
 
 
+PAPER = SceneConfig()
+"""Of the push data, as published."""
+
+
 def fixed_count(count: int, **changes: Any) -> SceneConfig:
     """A config with exactly `count` objects."""
     return SceneConfig(slots=count, counts=(0.0,) * (count - 1) + (1.0,), **changes)
@@ -95,7 +99,7 @@ def parse_objects(text: str, *, ranges: Ranges = DEFAULT_RANGES) -> SceneConfig:
       UserError: the text is none of these.
     """
     if text == "paper":
-        return SceneConfig(ranges=ranges)
+        return dataclasses.replace(PAPER, ranges=ranges)
     low, _, high = text.partition(":")
     try:
         first, last = int(low), int(high or low)

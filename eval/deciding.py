@@ -61,9 +61,9 @@ class Plan:
         result: Rule = rule.replace(gamma=self.gamma, threshold=self.threshold)
         return result
 
-    def longest(self) -> float:
-        """Metres."""
-        return max(self.distances)
+    def spread(self) -> np.ndarray:
+        """The distance of each candidate `[P]`, metres."""
+        return np.resize(np.asarray(self.distances, np.float32), self.candidates)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,15 +116,22 @@ def load(plan: Plan, nets: Nets, engine: Engine, *, slots: int) -> Decider:
     Raises:
       UserError: a network that the method needs was not given, or is another.
     """
+    return load_each([plan], nets, engine, slots=slots)[0]
+
+
+def load_each(plans: list[Plan], nets: Nets, engine: Engine, *, slots: int) -> list[Decider]:
+    """Deciders of plans that differ in their distances and their rule: one compiled program. Arguments as of `load`."""
+    plan = plans[0]
     runs = nets.require(plan.method)
-    distances = np.resize(np.asarray(plan.distances, np.float32), plan.candidates)
+    if plan.method == "gn":
+        return [best_grasp(policy.load_scorer(runs["grasp"]), slots=slots)] * len(plans)
+    made: Callable[..., Choice]
     if plan.method == "physics+gn":
         scorer, appraise = policy.load_scorer(runs["grasp"]), policy.load_appraiser(runs["grasp"])
-        return functools.partial(_rolled_out, scorer, appraise, engine, plan.rule(), distances)
-    if plan.method == "gn":
-        return best_grasp(policy.load_scorer(runs["grasp"]), slots=slots)
-    decide = _decide(plan, runs, slots)
-    return functools.partial(_in_lockstep, decide, plan.rule(), distances)
+        made = functools.partial(_rolled_out, scorer, appraise, engine)
+    else:
+        made = functools.partial(_in_lockstep, _decide(plan, runs, slots))
+    return [functools.partial(made, each.rule(), each.spread()) for each in plans]
 
 
 def best_grasp(scorer: planner.Scorer, *, slots: int) -> Decider:

@@ -33,6 +33,11 @@ class Film:
     mass: np.ndarray  # [N] kg
     friction: np.ndarray  # [N]
 
+    def before(self, step: int) -> np.ndarray:
+        """Colours `[224, 224, 3]` before an action."""
+        scene = Scene(self.shape[step], self.size, self.color, self.mass, self.friction)
+        return np.asarray(render.render(scene, self.poses[step]).color)
+
     def pictures(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Colours `[224, 224, 3]` before an action, as predicted for the best push, and after the action."""
 

@@ -63,7 +63,7 @@ def test_a_missing_folder(call, tmp_path: pathlib.Path) -> None:
     _one_line(call("train", "push", "--data", nowhere, "--out", tmp_path / "r"), "no manifest.json")
     _one_line(call("eval", "prediction", "--push-net", nowhere, "--out", tmp_path / "e"), "no such folder")
     _one_line(call("eval", "clear", "--grasp-net", nowhere, "--out", tmp_path / "e"), "--push-net")
-    _one_line(call("eval", "report", "--out", tmp_path / "e", "--hard", nowhere), "metrics.json")
+    _one_line(call("eval", "report", "--out", tmp_path / "e", "--clear", nowhere), "metrics.json")
     assert list(tmp_path.iterdir()) == []
 
 

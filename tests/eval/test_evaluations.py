@@ -168,7 +168,8 @@ def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest
     assert Partial(out, {"other": 1}).load("fresh") == "fresh"
     tables = grasped + tables
     clearing.save(tables, out)
-    metrics.write(out, clearing.summary(tables), settings={})
+    settings = {"method": "dipn+gn", "label": "", "tables.cases": "hard", "tables.objects": "10"}
+    metrics.write(out, clearing.summary(tables), settings=settings)
     return tables, out
 
 
@@ -204,13 +205,13 @@ def test_the_report_is_one_file_with_its_pictures(
     (tmp_path / "p").mkdir()
     np.savez_compressed(tmp_path / "p" / "films.npz", **films)  # type: ignore[arg-type]
     metrics.write(tmp_path / "p", values, settings={})
-    merged = report.write(
-        tmp_path, prediction=tmp_path / "p", grasp=None, hard=cleared[1], random=None, runs=list(runs.values())
-    )
+    options: dict[str, Any] = {"grasp": None, "clears": [cleared[1]], "sweep": None, "runs": list(runs.values())}
+    merged = report.write(tmp_path, prediction=tmp_path / "p", **options)
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 4
+    assert "74.4" in page, "the paper's numbers stand beside"
     assert 'src="http' not in page and "href=" not in page
-    assert merged["clear/hard/completion"] == metrics.read(cleared[1])["completion"]
+    assert merged["clear/hard/dipn+gn/completion"] == metrics.read(cleared[1])["completion"]
     assert (
         json.loads((tmp_path / "metrics.json").read_text())["push_error/dipn/5cm/all"]
         == values["push_error/dipn/5cm/all"]
