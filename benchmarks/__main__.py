@@ -54,6 +54,15 @@ BENCHMARKS = {
     "bench_grasp.vs_torch": Benchmark(
         "training samples a second of both GNs over the same in PyTorch, and memory", ">= 1", "bench_grasp:vs_torch"
     ),
+    "decide.speed": Benchmark(
+        "seconds a decision; with 64 candidates over the published networks one candidate and rotation at a time",
+        ">= 50",
+        "deciding:speed",
+    ),
+    "decide.fast_path": Benchmark(
+        "share of scenes on which the fast path decides as the plain one", ">= 0.99", "deciding:fast_path"
+    ),
+    "decide.lockstep": Benchmark("episodes a minute in lockstep over one by one", "none", "deciding:lockstep"),
     "rates.native": Benchmark("episodes a second of MuJoCo C, 1 to 30 objects", "none", "rates:native"),
     "rates.mjx": Benchmark("episodes a second of MJX, 1 to 30 objects", "none", "rates:mjx"),
     "rates.warp": Benchmark("episodes a second of MuJoCo Warp, 1 to 30 objects", "none", "rates:warp"),

@@ -11,6 +11,7 @@ from eval import metrics
 
 
 def check(out: pathlib.Path, seed: int, **counts: int) -> None:
+    """Refuse counts that are not positive, a seed that is none, an `out` that cannot be a folder."""
     console.require_positive(**counts)
     console.require_seed(seed)
     console.require_out(out)
@@ -26,6 +27,7 @@ def plain(value: Any) -> Any:
 
 
 def finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], partial: resume.Partial) -> None:
+    """Write the metrics of an evaluation, drop what it kept for going on, and say them."""
     metrics.write(out, values, settings={key: plain(value) for key, value in settings.items()})
     partial.finish()
     for name, value in values.items():

@@ -109,3 +109,25 @@ def test_guided_grasps_are_where_the_scores_are_high_and_hard_ones_where_they_ar
 def test_the_best_grasps_stand_apart() -> None:
     scores = jnp.zeros((16, 64, 64)).at[0, 10, 10].set(0.9).at[1, 10, 12].set(0.8).at[2, 40, 40].set(0.7)
     np.testing.assert_array_equal(candidates.best_grasps(scores, count=2), [[0, 10, 10], [2, 40, 40]])
+
+
+def test_a_push_can_begin_where_the_footprint_is_free(settled: Any) -> None:
+    seen = _seen(settled)
+    possible = np.asarray(candidates.pushable(seen.height))
+    assert possible.shape == (16, 224, 224) and not possible[:, :10].any() and not possible[:, :, 215:].any()
+    rng = np.random.default_rng(0)
+    index = np.stack([rng.integers(16, size=400), rng.integers(20, 204, 400), rng.integers(20, 204, 400)], -1)
+    pushes = jax.vmap(candidates.push_at, in_axes=(0, None))(index, 0.1)
+    free = np.asarray(
+        jax.vmap(candidates.footprint_free, in_axes=(None, 0, 0))(seen.height, pushes.start, pushes.angle)
+    )
+    at = possible[tuple(index.T)]
+    assert 0.3 < free.mean() < 0.98
+    assert (at == free).mean() > 0.97, "they differ only within a pixel of an object"
+    np.testing.assert_array_equal(jax.vmap(candidates.push_index)(pushes), index)
+
+
+def test_each_candidate_may_have_its_own_distance(settled: Any) -> None:
+    distances = np.linspace(0.03, 0.1, 8, dtype=np.float32)
+    pushes, _ = candidates.sample_pushes(jax.random.key(0), _seen(settled), count=8, slots=5, distance=distances)
+    np.testing.assert_array_equal(pushes.distance, distances)

@@ -190,6 +190,9 @@ def test_a_distance_does_not_depend_on_which_others_are_asked(forward: Any, inpu
     reversed_ = forward(inputs, DISTANCES[:, ::-1])
     np.testing.assert_allclose(several, reversed_[:, :, ::-1], atol=1e-5)
     assert np.abs(forward(inputs, np.zeros_like(DISTANCES))).max() == 0, "a push of no length moves nothing"
+    ends = forward(inputs, np.tile(np.array([0.09, 0.10, 0.12], np.float32), (6, 1)))
+    beyond = ends[:, :, 1] + 2 * (ends[:, :, 1] - ends[:, :, 0])
+    np.testing.assert_allclose(ends[:, :, 2], beyond, atol=1e-3)  # past 10 cm objects go on as in the last centimetre
     halfway = forward(inputs, np.tile(np.array([0.04, 0.05, 0.045], np.float32), (6, 1)))
     np.testing.assert_allclose(halfway[:, :, 2], halfway[:, :, :2].mean(2), atol=1e-4)
 
@@ -218,6 +221,8 @@ def test_scores_by_tables_are_scores_of_turned_maps() -> None:
     half = jnp.asarray(grasp_angles())[:8]
     views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, grasp.VIEW) + table)(half)
     plain = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, 224))(nnx.sigmoid(model(views)), half)
+    plain = plain.at[:, image[..., 3] == 0].set(0.0)  # no grasp is centred on empty table
+    assert plain.max() > 0.1
     quick = np.asarray(nnx.jit(grasp.score_image)(model, image))
     assert (np.abs(quick[:8] - plain) < 1e-5).mean() > 0.999  # but for pixels at the border between two
     np.testing.assert_array_equal(quick[8:], quick[:8])

@@ -97,3 +97,39 @@ def test_trans_moves_only_the_pushed_object_by_the_push_length(seen: Observation
     feasible = np.asarray(decision.feasible)
     assert ((length > 0).sum(-1)[feasible] == 1).all()
     np.testing.assert_allclose(length.max(-1)[feasible], 0.1, rtol=1e-5)
+
+
+def test_clauses_of_the_released_code(seen: Observation) -> None:
+    tempting = {"threshold": 2.0, "gamma": 1.1}
+    assert _decide(seen, static, covered, **tempting).is_push
+    assert not _decide(seen, static, covered, better=True, **tempting).is_push, "the best score does not rise"
+    # gamma counts only where the best score after the push is over `sure`
+    assert not _decide(seen, static, covered, sure=1.0, **tempting).is_push
+    one = seen.replace(label=jnp.where(seen.label == 0, 0, -1), height=jnp.where(seen.label == 0, seen.height, 0.0))
+    assert _decide(one, static, covered, **tempting).is_push
+    assert not _decide(one, static, covered, several=True, **tempting).is_push, "a lone object is grasped"
+    assert (planner.RELEASED.reach, planner.RELEASED.several, planner.RELEASED.better) == (2.0, True, True)
+
+
+def test_a_predicted_motion_counts_as_far_as_it_is_executed(seen: Observation) -> None:
+    def some(observation: Observation, pushes: Push) -> jax.Array:
+        return static(observation, pushes).at[..., 0].set(0.06)
+
+    near = _decide(seen, some, covered, threshold=2.0).feasible
+    far = _decide(seen, some, covered, threshold=2.0, reach=4.0).feasible
+    assert near.any() and not far.any()
+
+
+def test_the_better_of_two_values_is_done(seen: Observation) -> None:
+    def valued(value: float) -> Any:
+        return lambda images: jnp.full((images.shape[0], 16, 224, 224), value).at[:, 2, 112, 30].add(0.1)
+
+    options = {"slots": SLOTS, "distance": 0.1}
+    decision = planner.compare(seen, valued(0.7), valued(0.5), **options)
+    assert decision.is_push and decision.push.distance == np.float32(0.1)
+    possible = candidates.pushable(seen.height)
+    assert possible[tuple(candidates.push_index(decision.push))]
+    assert not planner.compare(seen, valued(0.7), valued(0.5), caution=2.0, **options).is_push
+    assert not planner.compare(seen, valued(0.7), valued(0.5), threshold=0.4, **options).is_push
+    assert not planner.compare(seen, valued(0.4), valued(0.5), **options).is_push
+    assert decision.grasp_pixel.tolist() == [2, 112, 30]

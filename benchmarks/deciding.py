@@ -1,0 +1,198 @@
+"""Seconds per decision, whether the fast path decides as the plain one, and what lockstep gains."""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+import tempfile
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from benchmarks.harness import Setting, alternate, quiet, seconds
+from dipn_jax import (
+    candidates,
+    cases,
+    checkpoint,
+    clutter,
+    geometry,
+    imagine,
+    planner,
+    policy,
+    render,
+    resume,
+    scenes,
+    structs,
+)
+from dipn_jax.networks.dipn import DipnConfig
+from dipn_jax.networks.grasp import VIEW, GraspConfig
+from dipn_jax.physics import make_engine
+from dipn_jax.structs import Decision, Observation, Push
+from dipn_jax.workspace import ROTATIONS, grasp_angles
+from eval import clearing, deciding, instances
+
+BUILTIN = pathlib.Path("builtin")
+COUNTS = (16, 64, 256)
+ALWAYS = planner.Rule(threshold=1.0)
+"""Pushes are considered however good the best grasp is: a decision at its full cost."""
+KINDS = (("3:8", 1.0), ("1:10", 0.0), ("20", 0.0), ("30", 0.0))
+"""Objects and share of packed scenes of those on which both paths decide."""
+
+
+def _networks(preset: str) -> tuple[Any, Any]:
+    """DIPN and GN: the trained compact ones, or published ones that know nothing; as fast as if they did."""
+    if preset == "compact":
+        return checkpoint.load_network(BUILTIN, network="dipn"), checkpoint.load_network(BUILTIN, network="grasp")
+    dipn = checkpoint.build("dipn", DipnConfig(preset="paper"))
+    gn = checkpoint.build("grasp", GraspConfig(preset="paper"))
+    dipn.eval()
+    gn.eval()
+    return dipn, gn
+
+
+def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> tuple[Observation, int]:
+    """Observations `[count]` of random scenes, and their slots."""
+    config = scenes.parse_objects(objects, ranges=scenes.Ranges(packed=packed))
+    items = clutter.settled_exactly(jax.random.key(seed), make_engine("native"), config, count)
+    return jax.device_get(clutter.observe(items.scene, items.poses)), config.slots
+
+
+def _decider(preset: str, slots: int, count: int, *, fast: bool) -> Callable[[Observation, int], Decision]:
+    dipn, gn = _networks(preset)
+    predictor, scorer = policy.dipn_predictor(dipn, slots), policy.grasp_scorer(gn)
+    appraise = policy.grasp_appraiser(gn) if fast else planner.plain(scorer)
+    options: dict[str, Any] = {"count": count, "slots": slots, "distance": 0.1, "rule": ALWAYS, "appraise": appraise}
+
+    def decide(seen: Observation, key: int) -> Decision:
+        return jax.device_get(planner.decide(jax.random.key(key), seen, predictor, scorer, **options))
+
+    return decide
+
+
+def speed(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Seconds a decision on a scene of ten objects, all of whose candidates are considered."""
+    seen, slots = _seen("10", 4, setting.seed)
+    tables = [structs.take(seen, i) for i in range(4)]
+    for count in COUNTS:
+        decide = _decider("compact", slots, count, fast=True)
+        decide(tables[0], 0)
+        taken = seconds(functools.partial(_all, decide, tables)) / len(tables)
+        yield f"decide.speed/compact/{count}", taken
+    few = setting.pick(2, 4)
+    each = _paper_one_by_one(tables[0], slots, few)
+    whole = _paper_whole(tables[0], slots, few)
+    for count in COUNTS:
+        yield f"decide.speed/paper/{count}", whole * (1 + count)
+    decide = _decider("compact", slots, 64, fast=True)
+    decide(tables[0], 0)
+    ours = seconds(lambda: _all(decide, tables)) / len(tables)
+    yield "decide.speed/paper_one_by_one/64", each * 65
+    yield "decide.speed/times_paper_one_by_one", each * 65 / ours
+
+
+def _all(decide: Callable[[Observation, int], Decision], tables: list[Observation]) -> None:
+    for table in tables:
+        decide(table, 0)
+
+
+def _imagined(seen: Observation, slots: int, count: int, predictor: Any) -> Callable[[int], jax.Array]:
+    """The image after candidate `i`, each predicted by itself."""
+    pushes, _ = candidates.sample_pushes(jax.random.key(0), seen, count=count, slots=slots, distance=0.1)
+
+    @jax.jit
+    def one(push: Push) -> jax.Array:
+        motion = predictor(seen, jax.tree.map(lambda leaf: leaf[None], push))[0]
+        centers, _ = candidates.mask_centers(seen.label, slots)
+        return render.rgbd(imagine.imagine(seen, centers, motion))
+
+    return lambda i: one(structs.take(pushes, i))
+
+
+def _paper_one_by_one(seen: Observation, slots: int, count: int) -> float:
+    """Seconds an image of the published networks, one candidate and one rotation at a time."""
+    dipn, gn = _networks("paper")
+    image_after = _imagined(seen, slots, count, policy.dipn_predictor(dipn, slots))
+    graph, state = nnx.split(gn)
+
+    @jax.jit
+    def rotation(image: jax.Array, angle: jax.Array) -> jax.Array:
+        table = jnp.array([*render.TABLE_COLOR, 0.0])
+        view = geometry.rotate_map(image - table, angle, VIEW) + table
+        score = nnx.sigmoid(nnx.merge(graph, state)(view[None]))[0]
+        return geometry.unrotate_map(score, angle, image.shape[0]).mean()
+
+    def work() -> None:
+        for i in range(count):
+            image = image_after(i)
+            np.mean([float(rotation(image, angle)) for angle in grasp_angles()[:ROTATIONS]])
+
+    work()
+    return seconds(work) / count
+
+
+def _paper_whole(seen: Observation, slots: int, count: int) -> float:
+    """Seconds an image of the published networks, all rotations of it in one call."""
+    dipn, gn = _networks("paper")
+    image_after = _imagined(seen, slots, count, policy.dipn_predictor(dipn, slots))
+    mean = jax.jit(lambda image: policy.grasp_scorer(gn)(image[None]).mean())
+
+    def work() -> None:
+        for i in range(count):
+            mean(image_after(i)).block_until_ready()
+
+    work()
+    return seconds(work) / count
+
+
+def fast_path(setting: Setting) -> Iterator[tuple[str, float]]:
+    """How often the fast path decides as the plain one, and how many times faster it is, with 64 candidates."""
+    each, same, total = setting.pick(10, 125), 0, 0
+    for objects, packed in KINDS:
+        seen, slots = _seen(objects, each, setting.seed, packed=packed)
+        plain, fast = (_decider("compact", slots, 64, fast=quick) for quick in (False, True))
+        tables = [structs.take(seen, i) for i in range(each)]
+        pairs = [(plain(table, i), fast(table, i)) for i, table in enumerate(tables)]
+        same += sum(_same(*pair) for pair in pairs)
+        total += each
+        sides = [functools.partial(_all, decide, tables[:4]) for decide in (plain, fast)]
+        slow, quick = alternate(*sides, repeats=3)
+        name = f"packed_{objects}" if packed else objects
+        yield f"decide.fast_path/times/{name.replace(':', '_')}", slow / quick
+    yield "decide.fast_path/scenes", total
+    yield "decide.fast_path", same / total
+
+
+def _same(plain: Decision, fast: Decision) -> bool:
+    """Whether both do the same: a grasp, which is then the same one, or the same push."""
+    return bool(plain.is_push == fast.is_push and (not plain.is_push or plain.best == fast.best))
+
+
+def lockstep(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Episodes of the hard instances a minute, side by side, over one after the other."""
+    engine, path = make_engine("native"), cases.hard_cases_path()
+    slots, repeats = int(cases.load_cases(path)[1].shape.shape[1]), setting.pick(1, 3)
+    nets = deciding.Nets(BUILTIN, BUILTIN)
+    decide = deciding.load(deciding.Plan(), nets, engine, slots=slots)
+
+    def tables() -> list[instances.Instance]:
+        return instances.hard_instances(engine, path, None, slots=slots, repeats=repeats, seed=setting.seed)
+
+    def clear(some: list[instances.Instance]) -> None:
+        with tempfile.TemporaryDirectory() as name, quiet():
+            clearing.clear(some, engine, decide, resume.Partial(pathlib.Path(name), {}), seed=setting.seed)
+
+    def together() -> None:
+        clear(tables())
+
+    def apart() -> None:
+        for table in tables():
+            clear([table])
+
+    together()
+    side_by_side, one_by_one = alternate(together, apart, repeats=setting.pick(1, 3))
+    yield "decide.lockstep", one_by_one / side_by_side
+    yield "decide.lockstep/episodes_per_minute", 60 * len(tables()) / side_by_side

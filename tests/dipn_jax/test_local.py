@@ -1,0 +1,61 @@
+"""The fast look at imagined images against scoring every one of them whole."""
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from dipn_jax import checkpoint, clutter, planner, policy, structs
+from dipn_jax.networks import local
+from dipn_jax.structs import Decision, Observation
+
+COUNT, SLOTS = 32, 5
+
+
+@pytest.fixture(scope="module")
+def scores() -> dict[str, Any]:
+    builtin = pathlib.Path("builtin")
+    gn: Any = checkpoint.load_network(builtin, network="grasp")
+    predictor = policy.load_predictor(builtin, SLOTS)
+    scorer = policy.grasp_scorer(gn)
+    fast = policy.grasp_appraiser(gn)
+
+    def decide(seen: Observation, quick: bool) -> Decision:
+        options: dict[str, Any] = {"count": COUNT, "slots": SLOTS, "distance": 0.1}
+        rule = planner.Rule(threshold=1.0)
+        return planner.decide(
+            jax.random.key(0), seen, predictor, scorer, rule=rule, appraise=fast if quick else None, **options
+        )
+
+    return {"decide": decide, "gn": gn}
+
+
+def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled: Any, scores: dict[str, Any]) -> None:
+    seen = clutter.observe(settled.scene, settled.poses)
+    many = 0
+    for i in range(6):
+        table = structs.take(seen, i)
+        plain, fast = (jax.device_get(scores["decide"](table, quick)) for quick in (False, True))
+        many += plain.feasible.sum() > local.FINALISTS
+        np.testing.assert_array_equal(plain.feasible, fast.feasible)
+        assert plain.best == fast.best and plain.is_push == fast.is_push
+        equal = np.isclose(plain.values, fast.values, rtol=1e-4) & plain.feasible
+        assert equal.sum() >= min(local.FINALISTS, plain.feasible.sum())
+    assert many, "every image was scored whole"
+
+
+def test_rough_means_rank_nearly_as_whole_images_do(settled: Any, scores: dict[str, Any]) -> None:
+    seen = clutter.observe(settled.scene, settled.poses)
+    image = np.asarray(jax.vmap(planner.render.rgbd)(seen))
+    now = image[0]
+    others = np.repeat(now[None], 8, 0)
+    for k in range(8):  # a block of one colour and height at different places
+        others[k, 20 + 20 * k : 45 + 20 * k, 30:80] = [0.5, 0.2, 0.2, 0.04]
+    whole, _ = planner.plain(policy.grasp_scorer(scores["gn"]))(now, others, np.ones(8, bool))
+    rough = jax.jit(lambda a, b, c: local.rough_means(scores["gn"], a, b, c))(now, others, np.ones(8, bool))
+    change = np.asarray(whole) - np.asarray(whole).min()
+    assert np.corrcoef(change, 2 * np.asarray(rough))[0, 1] > 0.9
+    same = jax.jit(lambda a, b, c: local.rough_means(scores["gn"], a, b, c))(now, np.stack([now] * 8), np.ones(8, bool))
+    np.testing.assert_array_equal(same, 0)
