@@ -64,7 +64,7 @@ def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> tuple[
 def _decider(preset: str, slots: int, count: int, *, fast: bool) -> Callable[[Observation, int], Decision]:
     dipn, gn = _networks(preset)
     predictor, scorer = policy.dipn_predictor(dipn, slots), policy.grasp_scorer(gn)
-    appraise = policy.grasp_appraiser(gn) if fast else planner.plain(scorer)
+    appraise = policy.grasp_appraiser(gn) if fast else planner.plain(policy.plain_scorer(gn))
     options: dict[str, Any] = {"count": count, "slots": slots, "distance": 0.1, "rule": ALWAYS, "appraise": appraise}
 
     def decide(seen: Observation, key: int) -> Decision:
@@ -138,7 +138,7 @@ def _paper_whole(seen: Observation, slots: int, count: int) -> float:
     """Seconds an image of the published networks, all rotations of it in one call."""
     dipn, gn = _networks("paper")
     image_after = _imagined(seen, slots, count, policy.dipn_predictor(dipn, slots))
-    mean = jax.jit(lambda image: policy.grasp_scorer(gn)(image[None]).mean())
+    mean = jax.jit(lambda image: policy.plain_scorer(gn)(image[None]).mean())
 
     def work() -> None:
         for i in range(count):

@@ -22,9 +22,9 @@ Predictor = Callable[[Observation, Push], jax.Array]
 Scorer = Callable[[jax.Array], jax.Array]
 """images [M, 224, 224, 4] -> scores [M, 16, 224, 224] in [0, 1]."""
 Appraiser = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
-"""(image now [224, 224, 4], images [P, ...], wanted [P] bool) -> mean and highest of all scores on each, [P] both.
+"""(image now [224, 224, 4], images [P, ...], wanted [P] bool) -> mean and highest of all scores on each, [1 + P] both.
 
-Of images that are not wanted it may say anything finite."""
+The first are those of the image now. Of images that are not wanted it may say anything finite."""
 
 STILL = (0.001, np.deg2rad(1.0))
 """Metres and radians of a predicted motion that is not drawn: half a pixel at an object's centre and at its end."""
@@ -68,7 +68,8 @@ def plain(scorer: Scorer) -> Appraiser:
             nothing = (jnp.zeros(()), jnp.zeros(()))
             return jax.lax.cond(want, lambda: _mean_and_best(scorer(image[None])), lambda: nothing)
 
-        return jax.lax.map(one, (images, wanted))
+        every, asked = jnp.concatenate([now[None], images]), jnp.append(wanted.any(), wanted)
+        return jax.lax.map(one, (every, asked))
 
     return appraise
 
@@ -122,16 +123,18 @@ def choose(
         )
 
     images = jax.lax.map(imagined, (drawn, allowed))
-    mean, highest = appraise(now, images, allowed)
-    taken = allowed & (~jnp.asarray(rule.better) | ((highest > proposal.grasp_score) & (mean > proposal.value_now)))
+    means, tops = appraise(now, images, allowed)
+    mean, highest = means[1:], tops[1:]
+    value_now = jnp.where(allowed.any(), means[0], proposal.value_now)
+    taken = allowed & (~jnp.asarray(rule.better) | ((highest > tops[0]) & (mean > means[0])))
     value = jnp.where(taken, jnp.where(highest > rule.sure, rule.gamma, 1.0) * mean, -jnp.inf)
     best = jnp.argmax(jnp.where(taken, mean, -jnp.inf)).astype(jnp.int32)
     return Decision(
-        is_push=value[best] > proposal.value_now,
+        is_push=value[best] > value_now,
         push=jax.tree.map(lambda leaf: leaf[best], proposal.pushes),
         grasp_pixel=proposal.grasp_pixel,
         grasp_score=proposal.grasp_score,
-        value_now=proposal.value_now,
+        value_now=value_now,
         value_push=value[best],
         predicted=images[best],
         best=best,

@@ -94,14 +94,24 @@ def dipn_predictor(model: dipn.DIPN, slots: int) -> Predictor:
 
 
 def grasp_scorer(model: grasp.GraspNet) -> Scorer:
-    """GN as a scorer, one image at a time."""
+    """GN as a scorer to act on: a `compact` one is asked with caution (`grasp.cautious_scores`), the published once."""
+    return _scorer(model, grasp.cautious_scores if model.config.preset == "compact" else grasp.score_image)
+
+
+def plain_scorer(model: grasp.GraspNet) -> Scorer:
+    """GN as a scorer, each image asked once."""
+    return _scorer(model, grasp.score_image)
+
+
+def _scorer(model: nnx.Module, score: Callable[[Any, jax.Array], jax.Array]) -> Scorer:
+    """One image at a time."""
     thaw = _frozen(model)
 
-    def score(images: jax.Array) -> jax.Array:
+    def scores(images: jax.Array) -> jax.Array:
         network = thaw()
-        return jax.lax.map(lambda image: grasp.score_image(network, image), images)  # type: ignore[arg-type]
+        return jax.lax.map(lambda image: score(network, image), images)
 
-    return score
+    return scores
 
 
 def grasp_appraiser(model: grasp.GraspNet) -> Appraiser:
@@ -110,7 +120,7 @@ def grasp_appraiser(model: grasp.GraspNet) -> Appraiser:
     `compact` networks on a CPU score only what moved; elsewhere images are scored whole.
     """
     if model.config.preset != "compact" or jax.default_backend() != "cpu":
-        return planner.plain(grasp_scorer(model))
+        return planner.plain(plain_scorer(model))
     thaw = _frozen(model)
 
     def appraise(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -125,29 +135,21 @@ def load_predictor(run: pathlib.Path, slots: int) -> Predictor:
 
 
 def load_scorer(run: pathlib.Path) -> Scorer:
-    """The scorer of a `dipn-train grasp` run."""
-    return grasp_scorer(checkpoint.load_network(run, network="grasp"))  # type: ignore[arg-type]
+    """The scorer of a `dipn-train grasp` run; cautious if its network is `compact`, the published one as published."""
+    model: Any = checkpoint.load_network(run, network="grasp")
+    return grasp_scorer(model, cautious=model.config.preset == "compact")
 
 
 def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
     """Scorers of pushes and of grasps; None where the network has no such part."""
     squash = nnx.sigmoid if model.config.answers == "chance" else (lambda x: x)
 
-    def scorer(part: nnx.Module, action: Literal["push", "grasp"]) -> Scorer:
-        thaw = _frozen(part)
+    def scorer(name: Literal["push", "grasp"]) -> Scorer | None:
+        if name not in model.config.parts:
+            return None
+        return _scorer(getattr(model, name), functools.partial(grasp.score_image, action=name, squash=squash))
 
-        def score(images: jax.Array) -> jax.Array:
-            network = thaw()
-            one = functools.partial(grasp.score_image, network, action=action, squash=squash)  # type: ignore[arg-type]
-            return jax.lax.map(one, images)
-
-        return score
-
-    parts = model.config.parts
-    return (
-        scorer(model.push, "push") if "push" in parts else None,
-        scorer(model.grasp, "grasp") if "grasp" in parts else None,
-    )
+    return scorer("push"), scorer("grasp")
 
 
 def load_values(run: pathlib.Path) -> tuple[Scorer | None, Scorer | None]:

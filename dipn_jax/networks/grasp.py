@@ -160,6 +160,22 @@ def score_image(
     return jnp.where(image[..., 3] > EMPTY, scores, 0.0) if action == "grasp" else scores
 
 
+def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
+    """The least of what `score_image` says of a grasp and of its mirror images: `[16, 224, 224]`.
+
+    A mirror image of a grasp is as good as the grasp, and both mirrors map the 16 angles onto themselves; so this is
+    four answers to one question. The best of a million scores is an overestimate; the least of four makes up for it.
+    """
+    turned_back = -np.arange(ROTATIONS) % ROTATIONS
+
+    def mirrored(axes: tuple[int, ...]) -> jax.Array:
+        scores = jnp.flip(score_image(network, jnp.flip(image, axes)), [axis + 1 for axis in axes])
+        return scores[turned_back] if len(axes) == 1 else scores
+
+    answers = [score_image(network, image), mirrored((0,)), mirrored((1,)), mirrored((0, 1))]
+    return functools.reduce(jnp.minimum, answers)
+
+
 def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:
     """Logits `[turns, 80, 80, 16]` of the pixels of all cells of the first `turns` turned views, `compact` only.
 

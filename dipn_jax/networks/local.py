@@ -123,19 +123,25 @@ def appraise(network: GraspNet, now: jax.Array, images: jax.Array, wanted: jax.A
       wanted: `[P]` bool.
 
     Returns:
-      `[P]` each, as whole images give them for the FINALISTS best; the least of theirs for all others.
+      `[1 + P]` each, of `now` first; as whole images give them for the FINALISTS best, the least of theirs for others.
     """
     rough = jnp.where(wanted, rough_means(network, now, images, wanted), -jnp.inf)
     _, chosen = jax.lax.top_k(rough, min(FINALISTS, len(rough)))
 
-    def whole(index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def whole(args: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        image, want = args
+
         def score() -> tuple[jax.Array, jax.Array]:
-            scores = score_image(network, images[index])
+            scores = score_image(network, image)
             return scores.mean(), scores.max()
 
         nothing = (jnp.zeros(()), jnp.zeros(()))
-        return jax.lax.cond(wanted[index], score, lambda: nothing)
+        return jax.lax.cond(want, score, lambda: nothing)
 
-    means, highest = jax.lax.map(whole, chosen)
-    spread = lambda values: jnp.full(len(rough), values.min()).at[chosen].set(values)  # noqa: E731
-    return spread(means), spread(highest)
+    means, highest = jax.lax.map(whole, (images[chosen], wanted[chosen]))
+    mean_now, highest_now = whole((now, wanted.any()))
+
+    def spread(first: jax.Array, values: jax.Array) -> jax.Array:
+        return jnp.append(first, jnp.full(len(rough), values.min()).at[chosen].set(values))
+
+    return spread(mean_now, means), spread(highest_now, highest)
