@@ -135,9 +135,8 @@ def load_predictor(run: pathlib.Path, slots: int) -> Predictor:
 
 
 def load_scorer(run: pathlib.Path) -> Scorer:
-    """The scorer of a `dipn-train grasp` run; cautious if its network is `compact`, the published one as published."""
-    model: Any = checkpoint.load_network(run, network="grasp")
-    return grasp_scorer(model, cautious=model.config.preset == "compact")
+    """The scorer of a `dipn-train grasp` run."""
+    return grasp_scorer(checkpoint.load_network(run, network="grasp"))  # type: ignore[arg-type]
 
 
 def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
