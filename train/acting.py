@@ -50,11 +50,12 @@ def look(
     keys: jax.Array,
     scene: Scene,
     poses: jax.Array,
+    wanted: jax.Array,
     *,
     scorer: Scorer | None,
     distance: float,
 ) -> Look:
-    """What there is to do on each of the tables `[T]`."""
+    """What there is to do on each of the tables `[T]` that are `wanted [T]`; zeros of the others."""
     network: VPG = nnx.merge(graph, params, rest)
     network.eval()
     pushes, grasps = policy.value_scorers(network)
@@ -84,7 +85,11 @@ def look(
             random_grasp=jax.tree.map(lambda leaf: leaf[0], anywhere),
         )
 
-    return jax.lax.map(one, (keys, scene, poses))
+    def some(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Look:
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, args[:3]))
+        return jax.lax.cond(args[3], lambda: one(args[:3]), lambda: nothing)
+
+    return jax.lax.map(some, (keys, scene, poses, wanted))
 
 
 def choose(now: Look, rng: np.random.Generator, actions: int, *, may_push: bool) -> tuple[np.ndarray, Push, Grasp]:

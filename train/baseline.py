@@ -31,7 +31,7 @@ from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Scorer
 from dipn_jax.scenes import SceneConfig
-from dipn_jax.structs import Grasp, GraspEpisode
+from dipn_jax.structs import Array, Grasp, GraspEpisode
 from train import acting, tables
 from train.acting import Look
 from train.grasp import PHASE, WINDOWS, Window, view, windows
@@ -68,6 +68,8 @@ class State:
     params: Any
     moments: Any
     tables: tables.Tables
+    then: Look | None = None  # at the tables after their last action, by the weights of then
+    anew: Array = None  # [T] bool: those that were set anew since
     round: int = 0
     seen: dict[str, list[Window]] = dataclasses.field(default_factory=lambda: {"push": [], "grasp": []})
     did: list[tuple[str, float]] = dataclasses.field(default_factory=list)  # primitive and reward of each action
@@ -155,11 +157,14 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     """One action on every table, what came of it, and what it teaches."""
     count, before = config.tables, state.tables
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.round), (2, count))
-    now: Look = jax.device_get(look(keys[0], before.scene, before.poses))
+    anew = np.ones(count, bool) if state.then is None else state.anew
+    now: Look = jax.device_get(look(keys[0], before.scene, before.poses, anew))
+    if state.then is not None:
+        now = jax.tree.map(lambda a, b: np.where(anew.reshape(-1, *[1] * (a.ndim - 1)), a, b), now, state.then)
     rng = np.random.default_rng([config.seed, state.round])
     pushing, push, grasp = acting.choose(now, rng, len(state.did), may_push="push" in PARTS[config.method])
     scene, poses, held, good = acting.execute(engine, before.scene, before.poses, pushing, push, grasp)
-    then: Look = jax.device_get(look(keys[1], scene, poses))
+    then: Look = jax.device_get(look(keys[1], scene, poses, np.ones(count, bool)))
     changed = acting.changed(now, then)
     success = held.any(1)
     effect = np.where(pushing, changed, success)
@@ -181,7 +186,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
             taught = windows(structs.take(tried, rows), pixels=WINDOWS["compact"] + 2 * PHASE)
             state.seen[name].append(taught)
     state.did += [("push" if pushing[i] else "grasp", float(reward[i])) for i in np.flatnonzero(good)]
-    state.tables.step(scene, poses, effect, good, engine, scenes)
+    state.anew, state.then = state.tables.step(scene, poses, effect, good, engine, scenes), then
 
 
 def _update(state: State, step: Callable[..., Any], rest: Any, config: BaselineConfig) -> tuple[Any, Any]:

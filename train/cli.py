@@ -230,7 +230,8 @@ def baseline(
     console.require_seed(seed)
     console.require_out(out)
     config = baselines.BaselineConfig(method, actions, tables, updates, batch, learning_rate, weight_decay, seed)
-    scorer = policy.load_scorer(checkpoint.find(grasp_net, network="grasp")) if grasp_net else None
+    gn: Any = checkpoint.load_network(grasp_net, network="grasp") if grasp_net else None
+    scorer = policy.plain_scorer(gn) if gn else None
     result = baselines.learn(make_engine(engine), scenes.parse_objects(objects), config, out, scorer=scorer)
     console.say(f"{out}: " + ", ".join(f"{name} {value:.3f}" for name, value in result.items()))
 

@@ -1,0 +1,102 @@
+"""Methods that clear tables: who needs what, decisions in lockstep, sweeps."""
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from dipn_jax import cases, checkpoint, scenes, structs
+from dipn_jax.errors import UserError
+from dipn_jax.networks.dipn import DipnConfig
+from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.networks.vpg import VpgConfig
+from eval import deciding, sweeping
+from eval.instances import Tables
+
+CONFIGS: dict[str, tuple[str, Any]] = {
+    "push": ("dipn", DipnConfig(width=8)),
+    "grasp": ("grasp", GraspConfig(width=8, coarse=8, blocks=1)),
+    "value": ("vpg", VpgConfig(width=8, coarse=8)),
+    "only": ("vpg", VpgConfig(parts=("grasp",), width=8, coarse=8)),
+}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
+    """Networks that know nothing."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name, (network, config) in CONFIGS.items():
+        model = checkpoint.build(network, config)
+        checkpoint.save(folder / name, 1, {"model": nnx.state(model)}, network=network, config=config, extra={})
+    return {name: folder / name for name in CONFIGS}
+
+
+def _nets(runs: dict[str, pathlib.Path]) -> deciding.Nets:
+    return deciding.Nets(runs["push"], runs["grasp"], runs["value"])
+
+
+@pytest.mark.parametrize("method", ["rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"])
+def test_every_method_decides_on_every_table_by_itself(
+    method: Any, engine: Any, settled: Any, runs: dict[str, pathlib.Path]
+) -> None:
+    plan = deciding.Plan(method, candidates=3, threshold=0.9, gamma=1.2)
+    decide = deciding.load(plan, _nets(runs), engine, slots=5)
+    keys = jax.random.split(jax.random.key(0), 3)
+    scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]
+    together = decide(keys, scene, poses)
+    assert together.is_push.shape == (3,) and together.motion.shape == (3, 5, 3)
+    alone = decide(keys[1:2], structs.take(scene, slice(1, 2)), poses[1:2])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[1:2], b, atol=1e-6), together, alone)
+    if method == "gn":
+        assert not together.is_push.any()
+    if method == "physics+gn":
+        assert np.abs(together.motion[together.is_push]).sum() > 0 or not together.is_push.any()
+
+
+def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pathlib.Path]) -> None:
+    for method, net in (("dipn+gn", "push"), ("vpg", "value"), ("physics+gn", "grasp")):
+        with pytest.raises(UserError, match=f"--method {method.replace('+', '.')}: wants --{net}-net"):
+            deciding.load(deciding.Plan(method), deciding.Nets(), engine, slots=5)  # type: ignore[arg-type]
+    grasps_only = deciding.Nets(None, runs["grasp"], runs["only"])
+    with pytest.raises(UserError, match="has not learnt to push"):
+        deciding.load(deciding.Plan("dqn+gn"), grasps_only, engine, slots=5)
+    with pytest.raises(UserError, match="holds a grasp network, want vpg"):
+        deciding.load(deciding.Plan("vpg"), deciding.Nets(value=runs["grasp"]), engine, slots=5)
+    with pytest.raises(UserError, match="--method search"):
+        deciding.Plan("search")  # type: ignore[arg-type]
+
+
+def test_of_several_distances_candidates_take_one_each() -> None:
+    plan = deciding.Plan(candidates=5, distances=(0.03, 0.06))
+    np.testing.assert_allclose(plan.spread(), [0.03, 0.06, 0.03, 0.06, 0.03])
+
+
+def test_tables_are_a_case_file_or_random() -> None:
+    assert Tables().path() == cases.hard_cases_path() and Tables().slots() == 6
+    assert Tables("random", objects="1:7").path() is None and Tables("random", objects="1:7").slots() == 7
+    with pytest.raises(UserError, match="--instances 0"):
+        Tables(instances=0)
+
+
+def test_distances_are_parsed_and_nonsense_is_refused() -> None:
+    assert sweeping.parse("0.03:0.12:0.01") == tuple(round(0.03 + 0.01 * i, 6) for i in range(10))
+    assert sweeping.parse("0.05:0.05:0.01") == (0.05,)
+    for wrong in ("0.03", "a:b:c", "0.1:0.03:0.01", "0.03:0.1:0", "0.03:0.1:0.02"):
+        with pytest.raises(UserError, match="--distances"):
+            sweeping.parse(wrong)
+
+
+def test_a_longer_push_is_harder_to_foresee(engine: Any) -> None:
+    from dipn_jax import policy
+
+    config = scenes.fixed_count(3, spread=0.2)
+    values = sweeping.prediction_errors(
+        policy.static_predictor(3), engine, config, (0.03, 0.12), scenes=6, seed=0, longest=0.12
+    )
+    near, far = (values[f"sweep/{name}/push_error/all"] for name in ("0.03", "0.12"))
+    assert 0 <= near < far <= 1
+    figures = {f"sweep/{name}/completion": 1.0 for name in ("0.03", "0.12", "chosen")}
+    assert "chosen" in sweeping.table(values | figures) and sweeping.figure(values | figures)

@@ -1,0 +1,132 @@
+"""The compared methods: rewards, targets, tables, and whether a run learns and goes on."""
+
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dipn_jax import checkpoint, policy, resume, scenes, structs
+from dipn_jax.errors import UserError
+from dipn_jax.structs import Grasp, Push
+from train import acting, baseline, tables
+from train.acting import Look
+
+CONFIG = scenes.fixed_count(3, spread=0.2)
+
+
+def _look(height: np.ndarray, grasp_value: float) -> Look:
+    count = len(height)
+    push = Push(np.zeros((count, 2)), np.zeros(count), np.zeros(count))
+    grasp = Grasp(np.zeros((count, 2)), np.zeros(count), np.zeros(count))
+    values = np.full(count, grasp_value)
+    return Look(height, push, values, push, np.ones(count, bool), grasp, values, grasp)
+
+
+def _heights(*pixels: int) -> np.ndarray:
+    """Maps with so many pixels of an object."""
+    maps = np.zeros((len(pixels), 224 * 224))
+    for row, count in zip(maps, pixels, strict=True):
+        row[:count] = 0.05
+    return maps.reshape(-1, 224, 224)
+
+
+def test_a_push_is_rewarded_for_change() -> None:
+    now, then = _look(_heights(1000, 1000), 0.5), _look(_heights(1299, 1301), 0.5)
+    np.testing.assert_array_equal(acting.push_reward(now, then, method="vpg"), [0.0, 0.5])
+
+
+def test_dqns_push_is_rewarded_for_a_better_grasp_and_for_what_it_uncovers() -> None:
+    now = _look(_heights(1000, 1000, 1000, 1000), 0.5)
+    then = _look(_heights(1000, 1000, 1400, 600), 0.8)
+    then.height[1] = np.roll(then.height[1], 1000)
+    reward = acting.push_reward(now, then, method="dqn")
+    np.testing.assert_allclose(reward, [0.0, 0.65, 0.8, 0.0])  # unchanged, moved, uncovered, covered
+    same = _look(then.height, 0.54)
+    np.testing.assert_allclose(acting.push_reward(now, same, method="dqn"), [0.0, 0.0, 0.8, 0.0])
+
+
+def test_tables_that_are_done_with_are_set_anew(engine: Any) -> None:
+    played = tables.begin(engine, CONFIG, count=4, seed=0)
+    scene, poses = jax.tree.map(np.array, played.scene), played.poses.copy()
+    scene.shape[0] = -1  # cleared
+    poses[1, 0, 0] = 0.3  # spilt
+    none, good = np.zeros(4, bool), np.array([True, True, False, True])
+    assert played.step(scene, poses, none, good, engine, CONFIG).tolist() == [True, True, True, False]
+    assert (played.scene.shape >= 0).all() and (np.abs(played.poses[..., :2]) < 0.224).all()
+    np.testing.assert_array_equal(played.poses[3], poses[3])
+    for stuck in (False, True):  # the last table was idle once before
+        again = played.step(played.scene, played.poses, none, np.ones(4, bool), engine, CONFIG)
+        assert again[3] == stuck
+
+
+def test_exploration_fades_and_reactive_grasps_never_push() -> None:
+    now = _look(_heights(*[1000] * 400), 0.5)
+    now = now.replace(push_value=np.full(400, 1.0))
+    early, late = (acting.choose(now, np.random.default_rng(0), n, may_push=True)[0].mean() for n in (0, 100_000))
+    assert early == pytest.approx(0.75, abs=0.07) and late == pytest.approx(0.95, abs=0.04)
+    assert not acting.choose(now, np.random.default_rng(0), 0, may_push=False)[0].any()
+
+
+@pytest.mark.parametrize("method", ["vpg", "rea"])
+def test_a_run_that_was_interrupted_goes_on_to_the_same_end(
+    method: Any, engine: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = baseline.BaselineConfig(method, actions=8, tables=4, updates=2, batch=4)
+    whole = baseline.learn(engine, CONFIG, config, tmp_path / "a")
+    save = resume.Partial.save
+
+    def stop(self: resume.Partial, state: Any) -> None:
+        save(self, state)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(resume.Partial, "save", stop)
+    with pytest.raises(KeyboardInterrupt):
+        baseline.learn(engine, CONFIG, config, tmp_path / "b")
+    monkeypatch.setattr(resume.Partial, "save", save)
+    assert baseline.learn(engine, CONFIG, config, tmp_path / "b") == whole
+    there, here = (checkpoint.load_network(tmp_path / name, network="vpg") for name in "ab")
+    assert checkpoint.digest(there) == checkpoint.digest(here)
+    pushes, grasps = policy.load_values(tmp_path / "a")
+    assert (pushes is None) == (method == "rea") and grasps is not None
+    with pytest.raises(UserError, match="takes no --grasp-net"):
+        baseline.learn(engine, CONFIG, config, tmp_path / "c", scorer=grasps)
+    with pytest.raises(UserError, match="seed"):
+        other = baseline.BaselineConfig(method, actions=8, tables=4, updates=2, batch=4, seed=1)
+        baseline.learn(engine, CONFIG, other, tmp_path / "a")
+
+
+def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
+    """A network fits two outcomes that differ in nothing but where they were tried."""
+    import optax
+    from flax import nnx
+
+    from dipn_jax.networks.vpg import VpgConfig
+    from dipn_jax.structs import GraspEpisode
+    from train.grasp import PHASE, WINDOWS, windows
+    from train.loop import make_step
+
+    played = tables.begin(engine, CONFIG, count=2, seed=1)
+    center = played.poses[:, 0, :2]
+    aim = Grasp(np.stack([center[0], center[0] + [0.0, 0.06]]), np.zeros(2), np.zeros(2))
+    first = structs.take(played.scene, np.zeros(2, int)), played.poses[np.zeros(2, int)]
+    held = np.zeros((2, 3), bool)
+    target = np.array([1.0, 0.0], np.float32)
+    batch = windows(
+        GraspEpisode(first[0], first[1], first[1], aim, held, target, np.zeros(2, int)),
+        pixels=WINDOWS["compact"] + 2 * PHASE,
+    )
+    batch = structs.take(batch, np.arange(32) % 2)  # each is moved by some pixels of its own
+    model = checkpoint.build("vpg", VpgConfig(parts=("grasp",), width=8, coarse=8))
+    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
+    optimizer = optax.adam(2e-3)
+    step = make_step(baseline._Outcomes("value"), graph, optimizer)
+    moments = optimizer.init(params)
+    values = []
+    for k in range(60):
+        params, rest, moments, loss = step(params, rest, moments, {"grasp": batch}, jax.random.key(k))
+        values.append(float(loss))
+    assert np.mean(values[-5:]) < 0.5 * np.mean(values[:5])
+    assert jnp.isfinite(loss)
