@@ -1,12 +1,12 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html (15 minutes on 2 cores)
 # make test   lint, types, tests
 # make bench  the figures of docs/benchmarks.md
-# make push-figures, make grasp-figures  those of docs/push-prediction.md and docs/grasping.md
+# make push-figures, make grasp-figures, make clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: setup demo test lint bench push-figures grasp-figures clean-demo
+.PHONY: setup demo test lint bench push-figures grasp-figures clear-figures clean-demo
 
 setup: .venv/.installed
 
@@ -80,6 +80,8 @@ push-figures: setup
 # learning curves, the network that comes with the package, and everything else on docs/grasping.md (two hours on 2 cores)
 GRASP := results/grasp
 GUIDED := $(BIN)/dipn-datagen grasp --actions
+PACKED := $(GUIDED) 8 --objects
+MORE := $(BIN)/dipn-train grasp --batch 64 --data $(GRASP)/first $(GRASP)/second
 NO_ARCHES := triangle cuboid_half cuboid_flat cuboid_long cube half_cylinder cylinder cylinder_flat half_cylinder_large cuboid_mid cuboid_square triangle_flat
 grasp-figures: setup
 	$(BIN)/dipn-datagen images --out $(GRASP)/images --episodes 100
@@ -95,14 +97,43 @@ grasp-figures: setup
 	$(BIN)/dipn-train grasp --data $(GRASP)/first --init $(GRASP)/pretrained --steps 1500 --batch 64 --learning-rate 2e-3 --out $(GRASP)/once
 	$(GUIDED) 8 --objects 1:20 --episodes 6000 --seed 1 --grasp-net $(GRASP)/once --guided 0.6 --hard 0.3 --out $(GRASP)/second
 	$(BIN)/dipn-train grasp --data $(GRASP)/first $(GRASP)/second --init $(GRASP)/pretrained --steps 2500 --batch 64 --learning-rate 2e-3 --out $(GRASP)/twice
-	$(BIN)/dipn-eval grasp --grasp-net $(GRASP)/twice --scenes 200 --others 16 --out $(GRASP)/builtin-10
-	$(BIN)/dipn-eval grasp --grasp-net $(GRASP)/twice --scenes 30 --objects 30 --others 16 --out $(GRASP)/builtin-30
+	$(PACKED) 3:8 --packed 1 --episodes 9000 --seed 5 --grasp-net $(GRASP)/twice --guided 0.6 --hard 0.3 --out $(GRASP)/third
+	$(MORE) $(GRASP)/third --init $(GRASP)/pretrained --steps 3500 --learning-rate 2e-3 --out $(GRASP)/thrice
+	$(PACKED) 3:8 --packed 1 --episodes 8000 --seed 7 --grasp-net $(GRASP)/thrice --guided 0.7 --hard 0.25 --out $(GRASP)/fourth
+	$(MORE) $(GRASP)/third $(GRASP)/fourth --init $(GRASP)/thrice --steps 3000 --learning-rate 1.5e-3 --out $(GRASP)/fourfold
+	$(PACKED) 3:9 --packed 0.8 --episodes 6000 --seed 9 --grasp-net $(GRASP)/fourfold --guided 0.7 --hard 0.25 --out $(GRASP)/fifth
+	$(MORE) $(GRASP)/third $(GRASP)/fourth $(GRASP)/fifth --init $(GRASP)/fourfold --steps 2200 --learning-rate 1e-3 --out $(GRASP)/shipped
+	$(BIN)/dipn-eval grasp --grasp-net $(GRASP)/shipped --scenes 200 --others 16 --out $(GRASP)/builtin-10
+	$(BIN)/dipn-eval grasp --grasp-net $(GRASP)/shipped --scenes 30 --objects 30 --others 16 --out $(GRASP)/builtin-30
 	$(BIN)/dipn-datagen images --items $(NO_ARCHES) --out $(GRASP)/no-arches/images --episodes 100
 	$(BIN)/dipn-train grasp-pretrain --data $(GRASP)/no-arches/images --out $(GRASP)/no-arches/pretrained --steps 400
 	$(GUIDED) 6 --items $(NO_ARCHES) --objects 1:12 --episodes 5000 --grasp-net $(GRASP)/no-arches/pretrained --out $(GRASP)/no-arches/grasps
 	$(BIN)/dipn-train grasp --data $(GRASP)/no-arches/grasps --init $(GRASP)/no-arches/pretrained --steps 800 --batch 64 --learning-rate 2e-3 --out $(GRASP)/no-arches/gn
 	$(BIN)/dipn-eval grasp --grasp-net $(GRASP)/no-arches/gn --scenes 50 --items concave concave_slim --others 16 --out $(GRASP)/unseen-concave
 	$(BIN)/python docs/grasping.py $(GRASP)
+
+# the methods compared, with the samples that the paper gives them and with the shipped networks, on docs/clearing.md
+# (hours on 2 cores; needs push-figures' data and grasp-figures' pre-trained network)
+CLEAR := results/clear
+ON := results/clear/table
+TABLES := hard:--cases_hard_--instances_30 30:--cases_random_--objects_30_--instances_30
+clear-figures: setup
+	$(BIN)/dipn-train grasp-online --init $(GRASP)/pretrained --grasps 500 --out $(CLEAR)/gn
+	$(BIN)/dipn-train push --data $(PUSH)/data --limit 1500 --steps 3000 --out $(CLEAR)/dipn
+	$(BIN)/dipn-train push --data $(PUSH)/data --limit 2000 --steps 3000 --out $(CLEAR)/dipn-2000
+	$(BIN)/dipn-train baseline --method dqn --actions 1500 --grasp-net $(CLEAR)/gn --out $(CLEAR)/dqn
+	$(BIN)/dipn-train baseline --method rea --actions 1500 --out $(CLEAR)/rea
+	$(BIN)/dipn-train baseline --method vpg --actions 2500 --out $(CLEAR)/vpg
+	for each in $(TABLES); do \
+	  on=$${each%%:*}; tables=$$(echo $${each#*:} | tr _ ' '); paper="$(BIN)/dipn-eval clear $$tables --label paper"; \
+	  $(BIN)/dipn-eval clear $$tables --label large --push-net builtin --grasp-net builtin --out $(ON)/large-$$on || exit; \
+	  $$paper --push-net $(CLEAR)/dipn --grasp-net $(CLEAR)/gn --out $(ON)/dipn-gn-$$on || exit; \
+	  $$paper --method vpg --value-net $(CLEAR)/vpg --out $(ON)/vpg-$$on || exit; \
+	  $$paper --method rea+dipn --push-net $(CLEAR)/dipn-2000 --value-net $(CLEAR)/rea --out $(ON)/rea-dipn-$$on || exit; \
+	  $$paper --method dqn+gn --value-net $(CLEAR)/dqn --grasp-net $(CLEAR)/gn --out $(ON)/dqn-gn-$$on || exit; \
+	done
+	$(BIN)/dipn-eval report --clear $(ON)/* --out $(CLEAR)
+	$(BIN)/python docs/clearing.py $(ON)
 
 clean-demo:
 	rm -rf $(DEMO)
