@@ -155,7 +155,7 @@ def _cleared(
     *,
     longest: float,
 ) -> dict[str, Any]:
-    """Clear tables and write what came of it, or read it if these settings have been through before."""
+    """Clear tables and write what came of it; goes on where it was interrupted."""
     seed, path = settings["seed"], tables.path()
     partial = resume.Partial(out, settings, inputs=[*runs.values(), *([path] if path else [])])
     ended = clearing.clear(tables.make(physics, seed=seed), physics, decide, partial, seed=seed, longest=longest)
