@@ -189,7 +189,6 @@ def compare(
     *,
     slots: int,
     distance: jax.Array | float,
-    caution: jax.Array | float = 1.0,
     threshold: jax.Array | float = jnp.inf,
 ) -> Decision:
     """Choose without imagining, as VPG does: the best of all grasps, or the best of all pushes.
@@ -200,7 +199,6 @@ def compare(
       scorer: values of grasps.
       slots: number of object slots N in the labels.
       distance: push distance, metres.
-      caution: a push is made when its value is over so many times the best grasp's (2 in VPG's reactive form).
       threshold: grasp at once if the best grasp's value is higher.
 
     Returns:
@@ -213,7 +211,7 @@ def compare(
     where, push_value = candidates.best_grasp(values)
     push = candidates.push_at(where, distance)
     return Decision(
-        is_push=(push_value > caution * grasp_value) & (grasp_value <= threshold),
+        is_push=(push_value > grasp_value) & (grasp_value <= threshold),
         push=push,
         grasp_pixel=index,
         grasp_score=grasp_value,

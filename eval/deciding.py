@@ -23,10 +23,8 @@ from dipn_jax.structs import Array, Decision, Grasp, Observation, Push, Pytree, 
 MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
 LONGEST = 0.12
 """Metres of a push at most."""
-CAUTION = {"vpg": 1.0, "dqn+gn": 1.0}
-"""How many times the best grasp's value a push must be worth."""
-
-
+UNIMAGINED = ("vpg", "dqn+gn")
+"""Methods that compare values of pushes and grasps, and imagine nothing."""
 WANTED = {
     "dipn+gn": ("push", "grasp"),
     "rea+dipn": ("push", "value"),
@@ -147,7 +145,7 @@ def best_grasp(scorer: planner.Scorer, *, slots: int) -> Decider:
 
 def _decide(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
     """One table's decision as a function of key, observation, distances and rule."""
-    if plan.method in CAUTION:
+    if plan.method in UNIMAGINED:
         return _compare(plan, runs, slots)
     predictor = policy.load_predictor(runs["push"], slots)
     if plan.method == "rea+dipn":
@@ -169,9 +167,8 @@ def _compare(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
     scorer = policy.load_scorer(runs["grasp"]) if with_gn else _part(runs["value"], "grasp")
 
     def compare(_: jax.Array, seen: Observation, distances: jax.Array, rule: Rule) -> Decision:
-        caution, threshold = CAUTION[plan.method], rule.threshold if with_gn else jnp.inf
-        options: dict[str, Any] = {"slots": slots, "distance": distances[0]}
-        return planner.compare(seen, pushes, scorer, caution=caution, threshold=threshold, **options)
+        threshold = rule.threshold if with_gn else jnp.inf
+        return planner.compare(seen, pushes, scorer, slots=slots, distance=distances[0], threshold=threshold)
 
     return compare
 

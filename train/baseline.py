@@ -42,6 +42,8 @@ PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",)
 """What each method learns: REA+DIPN uses REA's grasps only, DQN+GN has GN for its grasps."""
 DISCOUNT = 0.5
 """VPG's discount of what comes next."""
+DISTANCE = 0.10
+"""Metres of a push."""
 RECENT = 100
 """Actions over which the success of the moment is counted."""
 
@@ -58,7 +60,6 @@ class BaselineConfig:
     learning_rate: float = 5e-4
     weight_decay: float = 1e-4
     seed: int = 0
-    distance: float = 0.10  # metres of a push
 
 
 @dataclasses.dataclass
@@ -137,7 +138,7 @@ def learn(
     total = -(-config.actions // config.tables)
     with console.Progress(f"act and learn {config.method}", total, unit="rounds", done=state.round) as progress:
         while state.round < total:
-            look = functools.partial(acting.look, graph, state.params, rest, scorer=scorer, distance=config.distance)
+            look = functools.partial(acting.look, graph, state.params, rest, scorer=scorer, distance=DISTANCE)
             _act(state, look, engine, scenes, config)
             state.params, state.moments = _update(state, step, rest, config)
             state.round += 1

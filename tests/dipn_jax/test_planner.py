@@ -129,7 +129,6 @@ def test_the_better_of_two_values_is_done(seen: Observation) -> None:
     assert decision.is_push and decision.push.distance == np.float32(0.1)
     possible = candidates.pushable(seen.height)
     assert possible[tuple(candidates.push_index(decision.push))]
-    assert not planner.compare(seen, valued(0.7), valued(0.5), caution=2.0, **options).is_push
     assert not planner.compare(seen, valued(0.7), valued(0.5), threshold=0.4, **options).is_push
     assert not planner.compare(seen, valued(0.4), valued(0.5), **options).is_push
     assert decision.grasp_pixel.tolist() == [2, 112, 30]

@@ -53,7 +53,7 @@ def test_every_method_decides_on_every_table_by_itself(
     if method == "gn":
         assert not together.is_push.any()
     if method == "physics+gn":
-        assert np.abs(together.motion[together.is_push]).sum() > 0 or not together.is_push.any()
+        assert np.abs(together.motion).max() > 0.01, "the engine was not asked, or moved nothing"
 
 
 def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pathlib.Path]) -> None:
