@@ -18,14 +18,7 @@ import numpy as np
 import optax
 from flax import nnx
 
-from dipn_jax import (
-    checkpoint,
-    console,
-    files,
-    losses,
-    resume,
-    structs,
-)
+from dipn_jax import checkpoint, files, losses, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.physics import Engine
@@ -36,6 +29,7 @@ from train import acting, tables
 from train.acting import Look
 from train.grasp import PHASE, WINDOWS, Window, view, windows
 from train.loop import make_step
+from train.rounds import Run
 
 MethodName = Literal["vpg", "rea", "dqn"]
 PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
@@ -120,37 +114,33 @@ def learn(
     network = VpgConfig(parts=PARTS[config.method], answers="chance" if config.method == "rea" else "value")
     model: Any = checkpoint.build("vpg", network, seed=config.seed)
     identity = {**dataclasses.asdict(config), "scenes": str(scenes), "engine": type(engine).__name__}
-    files.claim(out, identity)
-    ended = checkpoint.newest(out)
+    run = Run(out, identity)
+    ended = run.ended()
     if ended:
-        return {name: value for name, value in ended[1].items() if name.startswith("reward/")}
-    partial = resume.Partial(out, identity)
+        return {name: value for name, value in ended.items() if name.startswith("reward/")}
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
     optimizer = optax.chain(
         optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
     )
     step = make_step(_Outcomes(network.answers), graph, optimizer)
-    state: State | None = partial.load(None)
-    if state is None:
-        fresh = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
-        params = jax.device_get(params)
-        state = State(params, jax.device_get(optimizer.init(params)), fresh)
-    total = -(-config.actions // config.tables)
-    with console.Progress(f"act and learn {config.method}", total, unit="rounds", done=state.round) as progress:
-        while state.round < total:
-            look = functools.partial(acting.look, graph, state.params, rest, scorer=scorer, distance=DISTANCE)
-            _act(state, look, engine, scenes, config)
-            state.params, state.moments = _update(state, step, rest, config)
-            state.round += 1
-            partial.save(state)
-            _log(out, state, config)
-            progress.advance(1, ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT).items()))
-    _log(out, state, config)  # again, should the last round have been cut short before it
+    weights = jax.device_get(params)
+
+    def fresh() -> State:
+        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
+        return State(weights, jax.device_get(optimizer.init(weights)), begun)
+
+    def act(state: State) -> str:
+        look = functools.partial(acting.look, graph, state.params, rest, scorer=scorer, distance=DISTANCE)
+        _act(state, look, engine, scenes, config)
+        state.params, state.moments = _update(state, step, rest, config)
+        return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT).items())
+
+    total, log = -(-config.actions // config.tables), functools.partial(_log, out, config)
+    state = run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
     nnx.update(model, jax.tree.map(jnp.asarray, state.params))
     result = _rewards(state.did, len(state.did)) | {f"{k}/recent": v for k, v in _rewards(state.did, RECENT).items()}
     extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
-    checkpoint.save(out, len(state.did), {"model": nnx.state(model)}, network="vpg", config=network, extra=extra)
-    partial.finish()
+    run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
     return result
 
 
@@ -217,7 +207,7 @@ def _rewards(did: list[tuple[str, float]], last: int) -> dict[str, float]:
     return result
 
 
-def _log(out: pathlib.Path, state: State, config: BaselineConfig) -> None:
+def _log(out: pathlib.Path, config: BaselineConfig, state: State) -> None:
     """`metrics.jsonl`: after so many actions, the mean rewards of the last ones."""
     counts = range(config.tables, len(state.did) + 1, config.tables)
     rows = [{"step": n, **_rewards(state.did[:n], RECENT)} for n in counts]

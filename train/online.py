@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from flax import nnx
 
-from dipn_jax import candidates, checkpoint, clutter, console, files, render, resume, structs
+from dipn_jax import candidates, checkpoint, clutter, files, render, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig, score_image
 from dipn_jax.physics import Engine
@@ -23,6 +23,7 @@ from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
 from train import tables
 from train.grasp import PHASE, WINDOWS, Window, executed_loss, windows
 from train.loop import make_step
+from train.rounds import Run
 from train.tables import Tables
 
 RECENT = 50
@@ -90,38 +91,33 @@ def learn(
         "scenes": str(scenes),
         "engine": type(engine).__name__,
     }
-    files.claim(out, identity)
-    ended = checkpoint.newest(out)
+    run = Run(out, identity)
+    ended = run.ended()
     if ended:
-        return {name: ended[1][name] for name in ("success", "success_recent")}
-    partial = resume.Partial(out, identity)
+        return {name: ended[name] for name in ("success", "success_recent")}
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
     optimizer = optax.chain(
         optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
     )
     step = make_step(_Outcomes(), graph, optimizer)
-    state: State | None = partial.load(None)
-    if state is None:
-        fresh = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
-        params = jax.device_get(params)
-        state = State(params, jax.device_get(optimizer.init(params)), fresh)
-    total = -(-config.grasps // config.tables)
     key = jax.random.key(config.seed)
-    with console.Progress("grasp and learn", total, unit="rounds", done=state.round) as progress:
-        while state.round < total:
-            _grasp(state, functools.partial(_choose, graph, state.params, rest), engine, scenes)
-            state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
-            state.round += 1
-            partial.save(state)
-            _log(out, state, config)
-            progress.advance(1, f"{np.mean(state.success[-RECENT:]):.2f} of the last {RECENT} held")
-    _log(out, state, config)  # again, should the last round have been cut short before it
+    weights = jax.device_get(params)
+
+    def fresh() -> State:
+        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
+        return State(weights, jax.device_get(optimizer.init(weights)), begun)
+
+    def act(state: State) -> str:
+        _grasp(state, functools.partial(_choose, graph, state.params, rest), engine, scenes)
+        state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
+        return f"{np.mean(state.success[-RECENT:]):.2f} of the last {RECENT} held"
+
+    log = functools.partial(_log, out, config)
+    state = run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
     nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
     result = {"success": float(np.mean(state.success)), "success_recent": float(np.mean(state.success[-RECENT:]))}
     extra = {"seed": config.seed, "examples": len(state.success), **result}
-    parts = {"model": nnx.state(model)}
-    checkpoint.save(out, len(state.success), parts, network="grasp", config=network_config, extra=extra)
-    partial.finish()
+    run.finish(model, len(state.success), network="grasp", config=network_config, extra=extra)
     return result
 
 
@@ -176,7 +172,7 @@ def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineCon
     return jax.device_get((params, moments))
 
 
-def _log(out: pathlib.Path, state: State, config: OnlineConfig) -> None:
+def _log(out: pathlib.Path, config: OnlineConfig, state: State) -> None:
     """`metrics.jsonl`: after so many grasps, success over the last ones."""
     counts = range(config.tables, len(state.success) + 1, config.tables)
     rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT) : n]))} for n in counts]

@@ -252,6 +252,26 @@ def test_geometric_labels_of_a_bar() -> None:
     assert crowded[80, 80] == 0, "a finger would land on the neighbour"
 
 
+def test_a_finger_that_would_land_on_something_tall_makes_a_grasp_doubtful() -> None:
+    # a cube in the middle, and 38 to 56 mm to the right of its centre a wall: over a fingertip at 20 mm by 30, or by 15
+    cube = jnp.zeros((224, 224)).at[100:125, 100:125].set(0.05)
+    tall, low = (cube.at[60:164, 131:140].set(high) for high in (0.05, 0.035))
+    blocked = np.asarray(grasp.blocked_image(tall))
+    assert blocked.shape == (16, 224, 224)
+    assert blocked[[0, 8], 112, 112].all() and not blocked[[4, 12], 112, 112].any()
+    assert not np.asarray(grasp.blocked_image(low))[:, 112, 112].any()
+    pile = jnp.full((224, 224), 0.08).at[60:164, 131:140].set(0.095)  # the tips go to 40 mm
+    assert not np.asarray(grasp.blocked_image(pile))[0, 112, 112]
+    model = grasp.GraspNet(grasp.GraspConfig(width=8, coarse=8, blocks=1), rngs=nnx.Rngs(0))
+    model.eval()
+    images = [jnp.zeros((224, 224, 4)).at[..., 3].set(height) for height in (tall, low)]
+    scores = [np.asarray(nnx.jit(grasp.cautious_scores)(model, image)) for image in images]
+    for image, cautious in zip(images, scores, strict=True):
+        plain = np.asarray(nnx.jit(grasp.score_image)(model, image))
+        assert (cautious <= plain + 1e-5).mean() > 0.999
+    assert 0 < scores[0][0, 112, 112] <= 0.5 < scores[0][0, 112, 112] / scores[1][0, 112, 112] * 1.5
+
+
 def test_the_angles_are_sixteen_even_ones() -> None:
     np.testing.assert_allclose(np.diff(grasp_angles()), np.pi / 8, atol=1e-6)
 

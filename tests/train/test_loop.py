@@ -113,7 +113,7 @@ def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pat
     whole = learn(tmp_path / "a")
     with pytest.MonkeyPatch.context() as patch:
 
-        def stop(out: pathlib.Path, state: online.State, plan: online.OnlineConfig) -> None:
+        def stop(out: pathlib.Path, plan: online.OnlineConfig, state: online.State) -> None:
             if state.round == 2:
                 raise KeyboardInterrupt
 

@@ -1,0 +1,79 @@
+"""A run whose work is rounds of acting: it goes on where it stopped, and ends with one checkpoint."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+from flax import nnx
+
+from dipn_jax import checkpoint, console, files, resume
+
+
+class State(Protocol):
+    """Everything that a run is at a moment; it pickles."""
+
+    round: int
+
+
+S = TypeVar("S", bound=State)
+
+
+class Run:
+    """The folder of a run."""
+
+    def __init__(self, out: pathlib.Path, identity: dict[str, Any]) -> None:
+        """Claim the folder.
+
+        Args:
+          out: folder: `config.json`, `checkpoints/`, and `partial.pickle` until the end.
+          identity: what the run is a function of.
+
+        Raises:
+          UserError: the folder holds another run.
+        """
+        files.claim(out, identity)
+        self.out = out
+        self._partial = resume.Partial(out, identity)
+
+    def ended(self) -> dict[str, Any] | None:
+        """What was saved at the end; None if that has not come."""
+        found = checkpoint.newest(self.out)
+        return found[1] if found else None
+
+    def play(
+        self,
+        fresh: Callable[[], S],
+        act: Callable[[S], str],
+        *,
+        total: int,
+        what: str,
+        log: Callable[[S], None] = lambda _: None,
+    ) -> S:
+        """Act until `total` rounds were made.
+
+        Args:
+          fresh: the state to begin with.
+          act: one round, in place; what there is to say of it.
+          total: rounds.
+          what: title of the progress.
+          log: writes what the rounds so far gave; a function of the state alone.
+        """
+        state: S | None = self._partial.load(None)
+        if state is None:
+            state = fresh()
+        with console.Progress(what, total, unit="rounds", done=state.round) as progress:
+            while state.round < total:
+                note = act(state)
+                state.round += 1
+                self._partial.save(state)
+                log(state)
+                progress.advance(1, note)
+        log(state)  # again, should the last round have been cut short before it
+        return state
+
+    def finish(self, model: nnx.Module, step: int, *, network: str, config: Any, extra: dict[str, Any]) -> None:
+        """Save the network; arguments as of `checkpoint.save`."""
+        checkpoint.save(self.out, step, {"model": nnx.state(model)}, network=network, config=config, extra=extra)
+        self._partial.finish()
