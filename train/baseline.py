@@ -34,8 +34,6 @@ from train.rounds import Run
 MethodName = Literal["vpg", "rea", "dqn"]
 PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
 """What each method learns: REA+DIPN uses REA's grasps only, DQN+GN has GN for its grasps."""
-DISCOUNT = 0.5
-"""VPG's discount of what comes next."""
 DISTANCE = 0.10
 """Metres of a push."""
 RECENT = 100
@@ -162,9 +160,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     reward = np.where(pushing, acting.push_reward(now, then, method=config.method), success.astype(float))
     target = reward
     if config.method == "vpg":
-        future = np.maximum(then.push_value, then.grasp_value)
-        left = (scene.shape >= 0).any(1) & effect & np.isfinite(future)
-        target = reward + DISCOUNT * np.where(left, future, 0.0)
+        target = acting.with_future(reward, then, (scene.shape >= 0).any(1) & effect)
     for name, rows, centre, angle in (
         ("push", pushing & good, push.start, push.angle),
         ("grasp", ~pushing & good, grasp.center, grasp.angle),

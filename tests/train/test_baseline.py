@@ -48,6 +48,13 @@ def test_dqns_push_is_rewarded_for_a_better_grasp_and_for_what_it_uncovers() -> 
     np.testing.assert_allclose(acting.push_reward(now, same, method="dqn"), [0.0, 0.0, 0.8, 0.0])
 
 
+def test_a_target_has_the_value_of_the_best_next_action_but_no_impossible_one() -> None:
+    then = _look(_heights(*[1000] * 4), 0.8)
+    then = then.replace(push_value=np.array([0.6, 1.2, 5.0, 1.0]))
+    target = acting.with_future(np.array([1.0, 0.5, 0.5, 0.0]), then, np.array([True, True, True, False]))
+    np.testing.assert_allclose(target, [1.4, 1.1, 1.5, 0.0])
+
+
 def test_tables_that_are_done_with_are_set_anew(engine: Any) -> None:
     played = tables.begin(engine, CONFIG, count=4, seed=0)
     scene, poses = jax.tree.map(np.array, played.scene), played.poses.copy()
