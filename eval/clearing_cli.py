@@ -130,19 +130,30 @@ def sweep(
     plans = [_plan(out, seed, "dipn+gn", candidates, spread, gamma, threshold, False) for spread in each.values()]
     nets = deciding.Nets(push_net, grasp_net)
     physics = make_engine(engine)
-    values: dict[str, Any] = {}
+    runs = nets.require("dipn+gn")
+    kept = resume.Partial(out, settings, inputs=_inputs(runs, tables))
+    ended: dict[str, dict[str, Any]] = kept.load({})
     deciders = deciding.load_each(plans, nets, physics, slots=tables.slots())
     for name, decide in zip(each, deciders, strict=True):
-        mine = settings | {"label": name}
-        found = _cleared(out / name, decide, physics, tables, mine, nets.require("dipn+gn"), longest=max(every))
-        values |= {f"sweep/{name}/{key}": value for key, value in found.items()}
+        if name not in ended:
+            mine = settings | {"label": name}
+            ended[name] = _cleared(out / name, decide, physics, tables, mine, runs, longest=max(every))
+            kept.save(ended)
+    values = {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
     if pushes:
         predictor = policy.load_predictor(checkpoint.find(push_net, network="dipn"), scenes.PAPER.slots)
         measure: dict[str, Any] = {"scenes": pushes, "seed": seed, "longest": max(every)}
         values |= sweeping.prediction_errors(predictor, physics, scenes.PAPER, every, **measure)
     sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
     metrics.write(out, values, settings={key: options.plain(value) for key, value in settings.items()})
+    kept.finish()
     console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
+
+
+def _inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]:
+    """What the course of things depends on, besides the options."""
+    path = tables.path()
+    return [*runs.values(), *([path] if path else [])]
 
 
 def _cleared(
@@ -156,8 +167,8 @@ def _cleared(
     longest: float,
 ) -> dict[str, Any]:
     """Clear tables and write what came of it; goes on where it was interrupted."""
-    seed, path = settings["seed"], tables.path()
-    partial = resume.Partial(out, settings, inputs=[*runs.values(), *([path] if path else [])])
+    seed = settings["seed"]
+    partial = resume.Partial(out, settings, inputs=_inputs(runs, tables))
     ended = clearing.clear(tables.make(physics, seed=seed), physics, decide, partial, seed=seed, longest=longest)
     clearing.save(ended, out)
     values = clearing.summary(ended)

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from dipn_jax import files
-from eval import drawing, film, metrics, paper
+from eval import clearing, drawing, film, metrics, paper
 
 FRAMES = 10
 """Pictures of a film."""
@@ -57,7 +57,8 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     for tables in dict.fromkeys(one.tables for one in all_cleared):
         rows = [one for one in all_cleared if one.tables == tables]
         parts.append(f"<h3>{html.escape(tables)}</h3>{_table(rows, paper.TABLE.get(tables, {}))}")
-        parts.append(f"<p>Why tables were not cleared:</p>{_causes(rows)}")
+        parts.append(f"<p>Why tables were not cleared:</p>{_causes(rows)}{{course-{tables}}}")
+        figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
             place = f"clear-{tables}-{number}"
             figures[place] = _films(one)
@@ -95,6 +96,28 @@ def _causes(rows: list[Cleared]) -> str:
         where = ", ".join(f"{name} ({failed.count(name)})" for name in sorted(set(failed)))
         lines.append([one.name, *counts, where or "-"])
     return drawing.table(["", *CAUSES.values(), "not cleared"], lines)
+
+
+def course(one: Cleared, at: np.ndarray) -> np.ndarray:
+    """Share of objects that are left after `at [A]` actions an object, the mean over tables: `[A]`."""
+    shares = []
+    for entry in one.episodes:
+        left = (film.load(one.folder / entry["file"]).shape >= 0).sum(1) / entry["objects"]
+        shares.append(np.interp(at * entry["objects"], np.arange(len(left)), left))
+    return np.mean(shares, axis=0)
+
+
+def _courses(rows: list[Cleared]) -> Any:
+    """How tables empty."""
+    figure, axis = plt.subplots(figsize=(6, 3.5))
+    at = np.linspace(0, clearing.ACTIONS_PER_OBJECT, 61)
+    for one in rows:
+        axis.plot(at, 100 * course(one, at), label=one.name)
+    axis.plot(at, 100 * np.maximum(1 - at, 0), color="0.7", lw=1, ls=":", label="an object an action")
+    axis.set(xlabel="actions an object", ylabel="objects left, %", ylim=(0, 102))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=7)
+    return figure
 
 
 def _films(one: Cleared) -> Any:

@@ -13,7 +13,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
-from eval import deciding, sweeping
+from eval import clearing_cli, deciding, metrics, sweeping
 from eval.instances import Tables
 
 CONFIGS: dict[str, tuple[str, Any]] = {
@@ -87,6 +87,29 @@ def test_distances_are_parsed_and_nonsense_is_refused() -> None:
     for wrong in ("0.03", "a:b:c", "0.1:0.03:0.01", "0.03:0.1:0", "0.03:0.1:0.02"):
         with pytest.raises(UserError, match="--distances"):
             sweeping.parse(wrong)
+
+
+def test_a_sweep_goes_on_at_the_distance_where_it_was_stopped(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def clear(out: pathlib.Path, *_: Any, **__: Any) -> dict[str, Any]:
+        asked.append(out.name)
+        if asked == ["0.03", "0.04"]:
+            raise KeyboardInterrupt
+        return {"completion": 1.0, "pushes": len(asked)}
+
+    def sweep(seed: int) -> None:
+        builtin = pathlib.Path("builtin")
+        clearing_cli.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), pushes=0, seed=seed)
+
+    monkeypatch.setattr(clearing_cli, "_cleared", clear)
+    with pytest.raises(KeyboardInterrupt):
+        sweep(1)
+    sweep(1)
+    assert asked == ["0.03", "0.04", "0.04", "chosen"]
+    assert metrics.read(tmp_path)["sweep/0.03/pushes"] == 1 and metrics.read(tmp_path)["sweep/0.04/pushes"] == 3
 
 
 def test_a_longer_push_is_harder_to_foresee(engine: Any) -> None:

@@ -16,7 +16,7 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.resume import Partial
 from dipn_jax.structs import Push
-from eval import clearing, deciding, film, grasping, instances, metrics, prediction, report
+from eval import clearing, comparison, deciding, film, grasping, instances, metrics, prediction, report
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
@@ -185,14 +185,26 @@ def test_every_table_ends_by_the_rules(cleared: Any, tmp_path: pathlib.Path) -> 
     assert [entry["name"] for entry in listed] == ["06", "10"]
     reel = film.load(out / listed[0]["file"])
     assert len(reel.what) == len(tables[0].film) == len(reel.poses) - 1
-    before, predicted, after = reel.pictures(len(reel.what) - 1)
+    before, predicted, _ = reel.pictures(0)
+    after = reel.pictures(len(reel.what) - 1)[2]
     assert before.shape == predicted.shape == after.shape == (224, 224, 3)
-    assert (before != after).any(), "an action leaves the table as it was"
+    assert (before != after).any(), "all actions leave the table as it was"
     cut = tmp_path / "cut.npz"
     for content in (b"", (out / listed[0]["file"]).read_bytes()[:-300]):
         cut.write_bytes(content)
         with pytest.raises(UserError, match="missing, damaged or no film"):
             film.load(cut)
+
+
+def test_the_course_of_clearing_is_what_was_left_after_each_action(cleared: Any) -> None:
+    tables, out = cleared
+    shares = comparison.course(comparison.Cleared(out), np.array([0.0, 3.0]))
+    left = [(table.scene.shape >= 0).sum() / table.objects for table in tables]
+    np.testing.assert_allclose(shares, [1.0, np.mean(left)])
+    after = [(t.film[min(t.objects, len(t.film) - 1)]["shape"] >= 0).sum() / t.objects for t in tables]
+    late = [(t.scene.shape >= 0).sum() / t.objects for t in tables]
+    wanted = np.mean([a if len(t.film) > t.objects else b for t, a, b in zip(tables, after, late, strict=True)])
+    np.testing.assert_allclose(comparison.course(comparison.Cleared(out), np.ones(1)), wanted)
 
 
 def test_the_report_is_one_file_with_its_pictures(
@@ -208,7 +220,7 @@ def test_the_report_is_one_file_with_its_pictures(
     options: dict[str, Any] = {"grasp": None, "clears": [cleared[1]], "sweep": None, "runs": list(runs.values())}
     merged = report.write(tmp_path, prediction=tmp_path / "p", **options)
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
     assert "74.4" in page, "the paper's numbers stand beside"
     assert 'src="http' not in page and "href=" not in page
     assert merged["clear/hard/dipn+gn/completion"] == metrics.read(cleared[1])["completion"]
