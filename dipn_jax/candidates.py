@@ -21,6 +21,9 @@ START_RANGE = (10, 214)  # pixels
 CENTER_RANGE = (25, 199)  # pixels: a centre predicted outside drops the push
 FREE_HEIGHT = 0.01  # metres: what is lower counts as free at the start
 
+CLEARANCE = 0.001  # metres between a fingertip and what it would press on
+GRIP = 0.015  # metres of an object that are between the fingers at least, whatever they press on
+
 _OVERSAMPLE = 4
 _TURNED = 320  # pixels of a turned map
 _MARGIN = 0.004  # metres around the gripper's footprint
@@ -149,11 +152,33 @@ def grasp_height(local_height: Array) -> jax.Array:
 
 
 def grasp_at(index: Array, height: jax.Array) -> Grasp:
-    """The grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres)."""
+    """The grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres).
+
+    The tips go to `grasp_height`, or stop on what a finger meets on its way if GRIP of the object is between them then.
+    """
     index = jnp.asarray(index)
     rotation, row, col = index[..., 0], index[..., 1], index[..., 2]
     center = geometry.pixels_to_metres(jnp.stack([col, row], -1))
-    return Grasp(center, rotation * jnp.float32(2 * jnp.pi / ROTATIONS), grasp_height(height[row, col]))
+    angle = rotation * jnp.float32(2 * jnp.pi / ROTATIONS)
+    local = height[row, col]
+    contact = under_fingers(height, center, angle) + CLEARANCE
+    return Grasp(center, angle, jnp.maximum(grasp_height(local), jnp.minimum(contact, local - GRIP)))
+
+
+def under_fingers(height: jax.Array, center: jax.Array, angle: jax.Array) -> jax.Array:
+    """The highest point `[...]`, metres, that the open fingers of grasps come down on.
+
+    Args:
+      height: `[H, W]` metres.
+      center: `[..., 2]` metres.
+      angle: `[...]` radians, of the closing axis.
+    """
+    step = WORKSPACE.pixel / 2
+    off = jnp.arange(GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness + step, step)
+    across = jnp.arange(-GRIPPER.pad_width / 2, GRIPPER.pad_width / 2 + step, step)
+    local = jnp.stack(jnp.meshgrid(jnp.concatenate([-off, off]), across), -1).reshape(-1, 2)
+    at = center[..., None, :] + geometry.rotate2d(local, angle[..., None])
+    return geometry.sample_nearest(height, geometry.metres_to_pixels(at), 0.0).max(-1)
 
 
 def grasp_index(grasp: Grasp) -> jax.Array:

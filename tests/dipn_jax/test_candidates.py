@@ -4,9 +4,11 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from dipn_jax import candidates, geometry, render, structs
 from dipn_jax.structs import ABSENT, Observation
+from dipn_jax.workspace import GRIPPER
 
 
 def _seen(settled: Any, index: int = 0) -> Observation:
@@ -131,3 +133,39 @@ def test_each_candidate_may_have_its_own_distance(settled: Any) -> None:
     distances = np.linspace(0.03, 0.1, 8, dtype=np.float32)
     pushes, _ = candidates.sample_pushes(jax.random.key(0), _seen(settled), count=8, slots=5, distance=distances)
     np.testing.assert_array_equal(pushes.distance, distances)
+
+
+def test_the_hand_stops_on_what_a_finger_meets() -> None:
+    def tip(object_height: float, neighbour: float, rotation: int = 0) -> float:
+        # 50 mm square in the middle; 4 mm beside where the fingers come down to its right, a neighbour
+        height = np.zeros((224, 224), np.float32)
+        height[100:125, 100:125] = object_height
+        height[60:165, 134:160] = neighbour
+        return float(candidates.grasp_at(jnp.array([rotation, 112, 112]), jnp.asarray(height)).height)
+
+    assert tip(0.05, 0.0) == pytest.approx(0.02)
+    assert tip(0.05, 0.025) == pytest.approx(0.026)
+    assert tip(0.05, 0.025, rotation=4) == pytest.approx(0.02)  # closing along the rows it is not met
+    assert tip(0.05, 0.06) == pytest.approx(0.035)  # as deep as it must
+    assert tip(0.025, 0.025) == pytest.approx(0.02)
+    assert tip(0.09, 0.04) == pytest.approx(0.05)  # goes by far over it
+
+
+def test_what_fingers_come_down_on_is_where_the_simulated_fingers_are(settled: Any, rng: np.random.Generator) -> None:
+
+    height = np.asarray(render.render(structs.take(settled.scene, 0), settled.poses[0]).height)
+    center = rng.uniform(-0.1, 0.1, (30, 2)).astype(np.float32)
+    angle = rng.uniform(0, 2 * np.pi, 30).astype(np.float32)
+    found = np.asarray(candidates.under_fingers(jnp.asarray(height), jnp.asarray(center), jnp.asarray(angle)))
+    row, col = np.indices(height.shape)
+    xy = (np.stack([col, row], -1) - 111.5) * 0.002
+    near, far, half = GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness, GRIPPER.pad_width / 2
+    for c, a, value in zip(center, angle, found, strict=True):
+        u = (xy - c) @ [np.cos(a), np.sin(a)]
+        v = (xy - c) @ [-np.sin(a), np.cos(a)]
+
+        def within(margin: float, u: np.ndarray = u, v: np.ndarray = v) -> float:
+            hit = (np.abs(u) > near - margin) & (np.abs(u) < far + margin) & (np.abs(v) < half + margin)
+            return float(height[hit].max())
+
+        assert within(-0.0005) - 1e-6 <= value <= within(0.003) + 1e-6
