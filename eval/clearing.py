@@ -15,7 +15,8 @@ from dipn_jax.physics import Engine
 from dipn_jax.structs import Fault
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 from eval import film, metrics
-from eval.deciding import Choice, Decider
+from eval.choices import Choice
+from eval.deciding import Decider
 from eval.instances import Instance
 
 ACTIONS_PER_OBJECT = 3

@@ -8,17 +8,18 @@ import pathlib
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import candidates, checkpoint, clutter, geometry, planner, policy, primitives, render, scenes, structs
+from dipn_jax import checkpoint, clutter, planner, policy, render
 from dipn_jax.errors import UserError
 from dipn_jax.networks import vpg
 from dipn_jax.physics import Engine
-from dipn_jax.planner import Proposal, Rule
-from dipn_jax.structs import Array, Decision, Grasp, Observation, Push, Pytree, Scene
+from dipn_jax.planner import Rule
+from dipn_jax.structs import Array, Decision, Observation, Scene
+from eval import choices, rollouts
+from eval.choices import Choice
 
 MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
 LONGEST = 0.12
@@ -84,18 +85,6 @@ class Nets:
         return {name: checkpoint.find(getattr(self, name), network=NETWORKS[name]) for name in WANTED[method]}
 
 
-@flax.struct.dataclass
-class Choice(Pytree):
-    """What was chosen for one table, and what it was chosen by."""
-
-    is_push: Array  # [] bool
-    push: Push  # the best one
-    grasp: Grasp  # the best one
-    grasp_pixel: Array  # [3] int32: rotation, row, col of it
-    values: Array  # [3] its score; mean score now (or its value); gamma times the mean after the push (or its value)
-    motion: Array  # [N, 3] dx, dy (metres), dtheta (radians) predicted for the push
-
-
 Decide = Callable[[jax.Array, Observation, jax.Array, Rule], Decision]
 """(key, observation, distances [P] metres, rule) -> decision; jitted, one table."""
 Decider = Callable[[jax.Array, Scene, Array], Choice]
@@ -126,7 +115,7 @@ def load_each(plans: list[Plan], nets: Nets, engine: Engine, *, slots: int) -> l
     made: Callable[..., Choice]
     if plan.method == "physics+gn":
         scorer, appraise = policy.load_scorer(runs["grasp"]), policy.load_appraiser(runs["grasp"])
-        made = functools.partial(_rolled_out, scorer, appraise, engine)
+        made = functools.partial(rollouts.decide, scorer, appraise, engine)
     else:
         made = functools.partial(_in_lockstep, _decide(plan, runs, slots))
     return [functools.partial(made, each.rule(), each.spread()) for each in plans]
@@ -212,104 +201,10 @@ def _choices(
 
     def one(key: jax.Array, scene: Scene, poses: jax.Array) -> Choice:
         seen = render.render(scene, poses)
-        return _choice(seen, decide(key, seen, distances, rule))
+        return choices.choice(seen, decide(key, seen, distances, rule))
 
     def some(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Choice:
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, *args[:3]))
         return jax.lax.cond(args[3], lambda: one(*args[:3]), lambda: nothing)
 
     return jax.lax.map(some, (keys, scene, poses, real))
-
-
-def _choice(seen: Observation, decision: Decision) -> Choice:
-    return Choice(
-        is_push=decision.is_push,
-        push=decision.push,
-        grasp=candidates.grasp_at(decision.grasp_pixel, seen.height),
-        grasp_pixel=decision.grasp_pixel,
-        values=jnp.stack([decision.grasp_score, decision.value_now, decision.value_push]),
-        motion=decision.motion,
-    )
-
-
-def _rolled_out(
-    scorer: planner.Scorer,
-    appraise: planner.Appraiser,
-    engine: Engine,
-    rule: Rule,
-    distances: np.ndarray,
-    keys: jax.Array,
-    scene: Scene,
-    poses: Array,
-) -> Choice:
-    """As `_in_lockstep`, but the engine itself says what pushes do, with masses and frictions that nobody can see."""
-    propose = functools.partial(_proposals, scorer=scorer, rule=rule, distances=distances)
-    proposals = clutter.in_few(propose, keys, scene, poses)
-    motion = _motions(engine, scene, poses, proposals, float(max(distances)))
-    choose = functools.partial(_chosen, appraise=appraise, rule=rule)
-    chosen: Choice = clutter.in_few(choose, scene, poses, proposals, motion)
-    return chosen
-
-
-@functools.partial(jax.jit, static_argnames="scorer")
-def _proposals(
-    keys: jax.Array,
-    scene: Scene,
-    poses: jax.Array,
-    real: jax.Array,
-    *,
-    scorer: planner.Scorer,
-    rule: Rule,
-    distances: jax.Array,
-) -> Proposal:
-    def one(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Proposal:
-        key, scene, poses, wanted = args
-        slots, seen = scene.shape.shape[0], render.render(scene, poses)
-        found = planner.propose(key, seen, scorer, rule, count=len(distances), slots=slots, distance=distances)
-        return found.replace(settled=found.settled | ~wanted)
-
-    return jax.lax.map(one, (keys, scene, poses, real))
-
-
-def _motions(engine: Engine, scene: Scene, poses: Array, proposals: Proposal, longest: float) -> np.ndarray:
-    """Motions `[B, P, N, 3]` of the pushes that matter, as the engine with nominal masses and frictions has them."""
-    asked = proposals.feasible & ~proposals.settled[:, None]
-    table, which = np.nonzero(asked)
-    motion = np.zeros((*asked.shape, scene.shape.shape[1], 3), np.float32)
-    guess = scenes.nominal(scene)
-    centers = np.asarray(clutter.in_chunks(_centers, guess, poses))
-    for begin in range(0, len(table), engine.batch):
-        rows, push = table[begin : begin + engine.batch], which[begin : begin + engine.batch]
-        pushes = jax.tree.map(lambda leaf, r=rows, p=push: leaf[r, p], proposals.pushes)
-        rollout = primitives.push(engine, structs.take(guess, rows), poses[rows], pushes, longest=longest)
-        after = np.asarray(rollout.poses)[:, -1]
-        motion[rows, push] = geometry.planar_motion(poses[rows], after, centers[rows])
-    return motion
-
-
-@jax.jit
-def _centers(scene: Scene, poses: jax.Array) -> jax.Array:
-    def one(pair: tuple[Scene, jax.Array]) -> jax.Array:
-        return candidates.mask_centers(render.render(*pair).label, pair[1].shape[0])[0]
-
-    return jax.lax.map(one, (scene, poses))
-
-
-@functools.partial(jax.jit, static_argnames="appraise")
-def _chosen(
-    scene: Scene,
-    poses: jax.Array,
-    proposals: Proposal,
-    motion: jax.Array,
-    real: jax.Array,
-    *,
-    appraise: planner.Appraiser,
-    rule: Rule,
-) -> Choice:
-    def one(args: tuple[Scene, jax.Array, Proposal, jax.Array, jax.Array]) -> Choice:
-        scene, poses, proposal, motion, wanted = args
-        seen = render.render(scene, poses)
-        proposal = proposal.replace(settled=proposal.settled | ~wanted)
-        return _choice(seen, planner.choose(seen, proposal, motion, appraise, rule))
-
-    return jax.lax.map(one, (scene, poses, proposals, motion, real))
