@@ -147,8 +147,16 @@ def test_the_hand_stops_on_what_a_finger_meets() -> None:
     assert tip(0.05, 0.025) == pytest.approx(0.026)
     assert tip(0.05, 0.025, rotation=4) == pytest.approx(0.02)  # closing along the rows it is not met
     assert tip(0.05, 0.06) == pytest.approx(0.035)  # as deep as it must
-    assert tip(0.025, 0.025) == pytest.approx(0.02)
+    assert tip(0.025, 0.025) == pytest.approx(0.023)  # low things: a little short
     assert tip(0.09, 0.04) == pytest.approx(0.05)  # goes by far over it
+
+
+def test_what_reaches_the_border_goes_on_beyond_it() -> None:
+    height = np.zeros((224, 224), np.float32)
+    height[100:125, 180:] = 0.03
+    across = np.array([[0, 112, 200], [4, 112, 200]])  # a finger outside the map; none
+    found = jax.vmap(candidates.grasp_at, in_axes=(0, None))(jnp.asarray(across), jnp.asarray(height)).height
+    np.testing.assert_allclose(found, [0.023, 0.02], atol=1e-6)
 
 
 def test_what_fingers_come_down_on_is_where_the_simulated_fingers_are(settled: Any, rng: np.random.Generator) -> None:
