@@ -20,7 +20,8 @@ from dipn_jax.errors import UserError
 from dipn_jax.physics import mjx, prisms
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.native import NativeEngine
-from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene
+from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene, Trajectory
+from dipn_jax.workspace import GRIPPER
 
 BATCH, SLOTS = 4, 3
 POSITION_TOLERANCE = 0.003
@@ -149,6 +150,30 @@ def test_a_fault_stays_in_its_episode(engine: MjxEngine, settled: tuple[Scene, n
     np.testing.assert_array_equal(found.fault[1:], [Fault.OUTSIDE, Fault.UNSETTLED, 0])
     np.testing.assert_array_equal(found.poses[3, :, :2], clean.poses[3, :, :2])
     np.testing.assert_allclose(found.poses[1, :, 1:], clean.poses[1, :, 1:], atol=1e-6)
+
+
+def test_a_fall_too_fast_a_stopped_hand_and_an_object_inside_another_are_faults(
+    engine: MjxEngine, settled: tuple[Scene, np.ndarray]
+) -> None:
+    scene, poses = settled
+    cubes = scene.replace(shape=np.where(scene.shape >= 0, CLASS["cuboid"], ABSENT), mass=np.full_like(scene.mass, 0.1))
+    cubes.mass[1, 1] = 60.0
+    bad = np.array(poses)
+    bad[..., 2:] = [0.025, 1, 0, 0, 0]
+    cubes = cubes.replace(size=np.full_like(cubes.size, 0.05))
+    inside = np.array(bad)
+    inside[3, 1, :2] = inside[3, 0, :2] + np.array([0.04, 0])
+    bad[0, 1, 2] = 2.0  # ends at 5.4 m/s
+    high = np.tile(np.array([0.1, 0, 0.2, 0, GRIPPER.push_gap], np.float32), (BATCH, 1))
+    low = np.array(high)
+    high[1, :2] = low[1, :2] = bad[1, 1, :2]
+    low[1, 2] = 0.01
+    down = Trajectory(np.tile(np.float32([0, 0.3]), (BATCH, 1)), np.stack([high, low], 1))
+    found = engine.simulate(cubes, bad, down, np.array([0.55]))
+    faults = (Fault.SPEED, Fault.SHORT)
+    np.testing.assert_array_equal([[bool(f & each) for each in faults] for f in found.fault], np.eye(4, 2, dtype=bool))
+    depth = [bool(f & Fault.PENETRATION) for f in primitives.settle(engine, cubes, inside, duration=0.01).fault]
+    assert depth == [False, False, False, True]
 
 
 def test_a_scene_does_not_depend_on_its_batch(engine: MjxEngine, settled: tuple[Scene, np.ndarray]) -> None:
