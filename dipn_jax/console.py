@@ -166,9 +166,15 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job manager's stop is an interruption
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            commands, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,)
-        )
+        try:
+            tyro.extras.subcommand_cli_from_dict(
+                commands, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,)
+            )
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # who reads what we say, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -1,7 +1,10 @@
 """Bad input at the command line: one line on standard error, exit code 2, nothing half-written."""
 
+import os
 import pathlib
 import shutil
+import subprocess
+import sys
 
 import pytest
 from flax import nnx
@@ -127,3 +130,13 @@ def test_help_teaches(stage: str, capfd: pytest.CaptureFixture[str]) -> None:
         assert stop.value.code == 0
         text = capfd.readouterr().out
         assert len(text) > 300 or name in ("verify", "repair", "info")
+
+
+def test_a_reader_that_has_seen_enough_is_no_mistake() -> None:
+    ours, theirs = os.pipe()
+    os.close(ours)
+    done = subprocess.run(
+        [sys.executable, "-m", "eval.cli", "--help"], stdout=theirs, stderr=subprocess.PIPE, check=False
+    )
+    os.close(theirs)
+    assert done.returncode == 141 and not done.stderr
