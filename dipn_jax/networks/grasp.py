@@ -29,6 +29,8 @@ EMPTY = 0.005
 """Metres above the table up to which a pixel shows none of an object: no grasp is centred there, and none is learnt."""
 BLOCKED = 0.02
 """Metres by which something under a finger stands over where its tip is to go: it can rarely push that aside."""
+WALL = 1.0
+"""Metres: what an object at the border of the image is taken for beyond it, where nobody sees it."""
 BLOCK = 4
 """Pixels a side of a cell: the compact network works on cells."""
 FINGER_COLUMNS = tuple(
@@ -262,8 +264,12 @@ def label_image(height: jax.Array) -> jax.Array:
 def blocked_image(height: jax.Array) -> jax.Array:
     """Which grasps on a height map `[224, 224]` a finger stops short of: `[16, 224, 224]`, 1 where so, else 0.
 
-    It would come down on something that stands BLOCKED over where its tip is to go.
+    It would come down on something that stands BLOCKED over where its tip is to go, or out of sight where what
+    reaches the border may go on.
     """
+    height = jnp.pad(height, (VIEW - WORKSPACE.pixels) // 2, mode="edge")
+    outside = jnp.abs(jnp.arange(VIEW) - (VIEW - 1) / 2) > WORKSPACE.pixels / 2
+    height = jnp.where((outside[:, None] | outside) & (height > EMPTY), WALL, height)
     return _of_every_grasp(height, lambda turned: (_under_fingers(turned) > _tip(turned) + BLOCKED).astype(jnp.float32))
 
 
