@@ -29,6 +29,11 @@ BENCHMARKS = {
     "datagen_mjx.batch_scaling": Benchmark(
         "cost of a scene's step at batch 128 over that at batch 16", "<= 1.0", "datagen_mjx:batch_scaling"
     ),
+    "datagen_mjx.settings": Benchmark(
+        "other settings of MJX: time over that of its own, millimetres from MuJoCo C after 5 cm, faults",
+        "none",
+        "mjx_settings:settings",
+    ),
     "render.vs_raycast": Benchmark("images a second over MuJoCo's ray caster", ">= 20", "rendering:vs_raycast"),
     "storage.vs_images": Benchmark("bytes of a push over PNGs of its frames", "<= 0.01", "storage:vs_images"),
     "compile.warm_over_cold": Benchmark(
