@@ -116,14 +116,16 @@ grasp-figures: setup
 # (hours on 2 cores; needs push-figures' data and grasp-figures' pre-trained network)
 CLEAR := results/clear
 ON := results/clear/table
-TABLES := hard:--cases_hard_--instances_30 30:--cases_random_--objects_30_--instances_30
+BASELINE := $(BIN)/dipn-train baseline --method
+TABLES := hard:--cases_hard_--instances_30 30:--cases_random_--objects_30_--instances_30 10:--cases_random_--objects_10_--instances_30
+FEWER := hard:--cases_hard_--instances_10 30:--cases_random_--objects_30_--instances_10
 clear-figures: setup
 	$(BIN)/dipn-train grasp-online --init $(GRASP)/pretrained --grasps 500 --out $(CLEAR)/gn
 	$(BIN)/dipn-train push --data $(PUSH)/data --limit 1500 --steps 3000 --out $(CLEAR)/dipn
 	$(BIN)/dipn-train push --data $(PUSH)/data --limit 2000 --steps 3000 --out $(CLEAR)/dipn-2000
-	$(BIN)/dipn-train baseline --method dqn --actions 1500 --grasp-net $(CLEAR)/gn --out $(CLEAR)/dqn
-	$(BIN)/dipn-train baseline --method rea --actions 1500 --out $(CLEAR)/rea
-	$(BIN)/dipn-train baseline --method vpg --actions 2500 --out $(CLEAR)/vpg
+	$(BASELINE) dqn --actions 1500 --grasp-net $(CLEAR)/gn --out $(CLEAR)/dqn
+	$(BASELINE) rea --actions 1500 --out $(CLEAR)/rea
+	$(BASELINE) vpg --actions 2500 --out $(CLEAR)/vpg
 	for each in $(TABLES); do \
 	  on=$${each%%:*}; tables=$$(echo $${each#*:} | tr _ ' '); paper="$(BIN)/dipn-eval clear $$tables --label paper"; \
 	  $(BIN)/dipn-eval clear $$tables --label large --push-net builtin --grasp-net builtin --out $(ON)/large-$$on || exit; \
@@ -132,8 +134,20 @@ clear-figures: setup
 	  $$paper --method rea+dipn --push-net $(CLEAR)/dipn-2000 --value-net $(CLEAR)/rea --out $(ON)/rea-dipn-$$on || exit; \
 	  $$paper --method dqn+gn --value-net $(CLEAR)/dqn --grasp-net $(CLEAR)/gn --out $(ON)/dqn-gn-$$on || exit; \
 	done
+	$(BASELINE) dqn --actions 3000 --grasp-net builtin --out $(CLEAR)/dqn-large
+	$(BASELINE) rea --actions 3000 --out $(CLEAR)/rea-large
+	$(BASELINE) vpg --actions 4000 --out $(CLEAR)/vpg-large
+	for each in $(FEWER); do \
+	  on=$${each%%:*}; tables=$$(echo $${each#*:} | tr _ ' '); large="$(BIN)/dipn-eval clear $$tables --label large"; \
+	  $$large --method vpg --value-net $(CLEAR)/vpg-large --out $(ON)/vpg-large-$$on || exit; \
+	  $$large --method rea+dipn --push-net builtin --value-net $(CLEAR)/rea-large --out $(ON)/rea-dipn-large-$$on || exit; \
+	  $$large --method dqn+gn --value-net $(CLEAR)/dqn-large --grasp-net builtin --out $(ON)/dqn-gn-large-$$on || exit; \
+	  $$large --method gn --grasp-net builtin --out $(ON)/gn-only-$$on || exit; \
+	  $$large --method physics+gn --grasp-net builtin --out $(ON)/physics-gn-$$on || exit; \
+	done
 	$(BIN)/dipn-eval report --clear $(ON)/* --out $(CLEAR)
 	$(BIN)/python docs/clearing.py $(ON)
+	$(BIN)/dipn-eval sweep --push-net builtin --grasp-net builtin --distances 0.03:0.12:0.01 --instances 3 --out $(CLEAR)/sweep
 
 clean-demo:
 	rm -rf $(DEMO)
