@@ -25,6 +25,8 @@ CLEARANCE = 0.001  # metres between a fingertip and what it would press on
 GRIP = 0.015  # metres of an object that are between the fingers at least, whatever they press on; of a low one less:
 GIVE = 0.003  # metres by which the tips stop short for it; measured: 5 of 892 grasps threw an object out, 1 with it
 
+ALIKE, ALIKE_TURNS = 10.0, 1  # pixels and rotations by which a grasp differs at most from one that it is like
+
 _OVERSAMPLE = 4
 _TURNED = 320  # pixels of a turned map
 _MARGIN = 0.004  # metres around the gripper's footprint
@@ -241,6 +243,23 @@ def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
     flat = jnp.argmax(scores)
     index = jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
     return index, scores.reshape(-1)[flat]
+
+
+def doubted(scores: jax.Array, missed: Array) -> jax.Array:
+    """Scores `[16, H, W]`, halved near grasps that missed, once for each.
+
+    Args:
+      scores: of grasps, now.
+      missed: `[M, 3]` int32 (rotation, row, col) of grasps that missed on what is there now; -1: none.
+    """
+    missed = jnp.asarray(missed)
+    half = ROTATIONS // 2  # a grasp turned by half a turn is the same grasp
+    turned = jnp.abs((jnp.arange(ROTATIONS)[:, None] - missed[:, 0] + half // 2) % half - half // 2)
+    alike = (turned <= ALIKE_TURNS) & (missed[:, 0] >= 0)
+    away = geometry.view_grid(*scores.shape[1:]) - missed[:, None, None, :0:-1]
+    near = jnp.linalg.norm(away, axis=-1) <= ALIKE
+    count = jnp.einsum("rm,mhw->rhw", alike.astype(scores.dtype), near.astype(scores.dtype))
+    return jnp.minimum(scores, scores * 0.5**count)
 
 
 def best_grasps(scores: jax.Array, *, count: int, apart: float = 8.0) -> jax.Array:

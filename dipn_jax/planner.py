@@ -26,6 +26,8 @@ Appraiser = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Arr
 
 The first are those of the image now. Of images that are not wanted it may say anything finite."""
 
+NONE_MISSED = np.full((1, 3), -1, np.int32)
+"""No grasp has missed."""
 STILL = (0.001, np.deg2rad(1.0))
 """Metres and radians of a predicted motion that is not drawn: half a pixel at an object's centre and at its end."""
 
@@ -87,10 +89,11 @@ def propose(
     count: int,
     slots: int,
     distance: Array,
+    missed: Array = NONE_MISSED,
 ) -> Proposal:
     """Score the grasps, and sample `count` pushes; arguments as of `decide`."""
     now = scorer(render.rgbd(observation)[None])[0]
-    index, best = candidates.best_grasp(now)
+    index, best = candidates.best_grasp(candidates.doubted(now, missed))
     pushes, feasible = candidates.sample_pushes(key, observation, count=count, slots=slots, distance=distance)
     _, area = candidates.mask_centers(observation.label, slots)
     alone = jnp.asarray(rule.several) & ((area > 0).sum() < 2)
@@ -157,6 +160,7 @@ def decide(
     distance: Array,
     rule: Rule = Rule(),  # noqa: B008
     appraise: Appraiser | None = None,
+    missed: Array = NONE_MISSED,
 ) -> Decision:
     """Choose between the best grasp and the best push.
 
@@ -170,12 +174,13 @@ def decide(
       distance: push distance, metres: one `[]`, or each candidate's own `[P]`.
       rule: how to compare.
       appraise: what all grasps on a predicted image are worth; every image is scored whole by default.
+      missed: `[M, 3]` grasps that missed on this table as it is; see `candidates.doubted`.
 
     Returns:
       The decision. A push is chosen when gamma times the mean score of all grasps on its predicted image
       exceeds the mean score now; a push that would move any centre out of the workspace is dropped.
     """
-    proposal = propose(key, observation, scorer, rule, count=count, slots=slots, distance=distance)
+    proposal = propose(key, observation, scorer, rule, count=count, slots=slots, distance=distance, missed=missed)
     still = lambda: jnp.zeros((count, slots, 3))  # noqa: E731
     motion = jax.lax.cond(proposal.settled, still, lambda: predictor(observation, proposal.pushes))
     return choose(observation, proposal, motion, appraise or plain(scorer), rule)
@@ -190,6 +195,7 @@ def compare(
     slots: int,
     distance: jax.Array | float,
     threshold: jax.Array | float = jnp.inf,
+    missed: Array = NONE_MISSED,
 ) -> Decision:
     """Choose without imagining, as VPG does: the best of all grasps, or the best of all pushes.
 
@@ -200,12 +206,13 @@ def compare(
       slots: number of object slots N in the labels.
       distance: push distance, metres.
       threshold: grasp at once if the best grasp's value is higher.
+      missed: `[M, 3]` as of `decide`.
 
     Returns:
       The decision; its only candidate is the best push that the closed gripper can begin.
     """
     image = render.rgbd(observation)
-    index, grasp_value = candidates.best_grasp(scorer(image[None])[0])
+    index, grasp_value = candidates.best_grasp(candidates.doubted(scorer(image[None])[0], missed))
     possible = candidates.pushable(observation.height)
     values = jnp.where(possible, push_scorer(image[None])[0], -jnp.inf)
     where, push_value = candidates.best_grasp(values)

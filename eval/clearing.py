@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import clutter, console, files, primitives, resume, structs
+from dipn_jax import clutter, console, files, geometry, planner, primitives, resume, structs
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Fault
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
@@ -21,6 +21,10 @@ from eval.instances import Instance
 
 ACTIONS_PER_OBJECT = 3
 """Source: the paper; more actions than that is a failure."""
+MISSES = 8
+"""Grasps that missed which are kept in mind, the latest."""
+STAYED, AROUND = 0.005, 0.06
+"""Metres: what has moved by more, so near the centre of a grasp that missed, makes it worth trying again."""
 
 
 def clear(
@@ -56,13 +60,14 @@ def clear(
             before = sum(instance.removed for instance in instances)
             scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
             now = jnp.stack([jax.random.fold_in(keys[number], instances[number].actions) for number in active])
-            choice = decide(now, scene, poses)
+            choice = decide(now, scene, poses, np.stack([_missed(row) for row in rows]))
             for is_push, act in ((True, functools.partial(_push, longest=longest)), (False, _grasp)):
                 which = np.flatnonzero(choice.is_push == is_push)
                 if len(which):
                     act([rows[i] for i in which], structs.take(choice, which), engine)
             for i, instance in enumerate(rows):
                 _remember(instance, (scene.shape[i], poses[i]), structs.take(choice, i))
+                _doubt(instance, (scene.shape[i], poses[i]), choice.grasp_pixel[i])
                 instance.ended = instance.ended or _ended(instance)
             partial.save(instances)
             removed = sum(instance.removed for instance in instances) - before
@@ -108,6 +113,21 @@ def _remember(instance: Instance, state: tuple[np.ndarray, np.ndarray], choice: 
             "motion": choice.motion.astype(np.float32),
         }
     )
+
+
+def _missed(instance: Instance) -> np.ndarray:
+    """The grasps that are doubted, padded: `[MISSES, 3]`."""
+    return np.stack([*instance.missed, *[planner.NONE_MISSED[0]] * (MISSES - len(instance.missed))])
+
+
+def _doubt(instance: Instance, state: tuple[np.ndarray, np.ndarray], grasp: np.ndarray) -> None:
+    """Keep in mind a grasp that missed, and forget those around which something has moved or is gone."""
+    shape, poses = state
+    missed = instance.missed + ((grasp,) if instance.did[-1] == "grasp missed" else ())
+    stayed = np.linalg.norm(instance.poses[:, :2] - poses[:, :2], axis=-1) < STAYED
+    moved = poses[(shape >= 0) & ~(stayed & (instance.scene.shape >= 0)), :2]
+    apart = [np.linalg.norm(moved - np.asarray(geometry.pixels_to_metres(each[:0:-1])), axis=-1) for each in missed]
+    instance.missed = tuple(each for each, away in zip(missed, apart, strict=True) if (away > AROUND).all())[-MISSES:]
 
 
 def _ended(instance: Instance) -> str:

@@ -85,10 +85,10 @@ class Nets:
         return {name: checkpoint.find(getattr(self, name), network=NETWORKS[name]) for name in WANTED[method]}
 
 
-Decide = Callable[[jax.Array, Observation, jax.Array, Rule], Decision]
-"""(key, observation, distances [P] metres, rule) -> decision; jitted, one table."""
-Decider = Callable[[jax.Array, Scene, Array], Choice]
-"""(keys [B], scenes [B, N], poses [B, N, 7]) -> choices [B], numpy."""
+Decide = Callable[[jax.Array, Observation, jax.Array, jax.Array, Rule], Decision]
+"""(key, observation, grasps that missed [M, 3], distances [P] metres, rule) -> decision; jitted, one table."""
+Decider = Callable[[jax.Array, Scene, Array, Array], Choice]
+"""(keys [B], scenes [B, N], poses [B, N, 7], grasps that missed [B, M, 3]) -> choices [B], numpy."""
 
 
 def load(plan: Plan, nets: Nets, engine: Engine, *, slots: int) -> Decider:
@@ -125,9 +125,9 @@ def best_grasp(scorer: planner.Scorer, *, slots: int) -> Decider:
     """The decider that grasps where `scorer` scores highest, and never pushes."""
     predictor = policy.static_predictor(slots)
 
-    def decide(key: jax.Array, seen: Observation, distances: jax.Array, rule: Rule) -> Decision:
+    def decide(key: jax.Array, seen: Observation, missed: jax.Array, distances: jax.Array, rule: Rule) -> Decision:
         options: dict[str, Any] = {"count": len(distances), "slots": slots, "distance": distances, "rule": rule}
-        return planner.decide(key, seen, predictor, scorer, **options)
+        return planner.decide(key, seen, predictor, scorer, missed=missed, **options)
 
     return functools.partial(_in_lockstep, decide, Rule(threshold=-1.0), np.array([0.1], np.float32))
 
@@ -142,9 +142,9 @@ def _decide(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
     else:
         scorer, appraise = policy.load_scorer(runs["grasp"]), policy.load_appraiser(runs["grasp"])
 
-    def imagine(key: jax.Array, seen: Observation, distances: jax.Array, rule: Rule) -> Decision:
+    def imagine(key: jax.Array, seen: Observation, missed: jax.Array, distances: jax.Array, rule: Rule) -> Decision:
         options: dict[str, Any] = {"count": plan.candidates, "slots": slots, "distance": distances, "rule": rule}
-        return planner.decide(key, seen, predictor, scorer, appraise=appraise, **options)
+        return planner.decide(key, seen, predictor, scorer, appraise=appraise, missed=missed, **options)
 
     return imagine
 
@@ -155,9 +155,10 @@ def _compare(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
     with_gn = plan.method == "dqn+gn"
     scorer = policy.load_scorer(runs["grasp"]) if with_gn else _part(runs["value"], "grasp")
 
-    def compare(_: jax.Array, seen: Observation, distances: jax.Array, rule: Rule) -> Decision:
+    def compare(_: jax.Array, seen: Observation, missed: jax.Array, distances: jax.Array, rule: Rule) -> Decision:
         threshold = rule.threshold if with_gn else jnp.inf
-        return planner.compare(seen, pushes, scorer, slots=slots, distance=distances[0], threshold=threshold)
+        options: dict[str, Any] = {"slots": slots, "distance": distances[0], "threshold": threshold, "missed": missed}
+        return planner.compare(seen, pushes, scorer, **options)
 
     return compare
 
@@ -177,11 +178,11 @@ def _part(run: pathlib.Path, name: str) -> planner.Scorer:
 
 
 def _in_lockstep(
-    decide: Decide, rule: Rule, distances: np.ndarray, keys: jax.Array, scene: Scene, poses: Array
+    decide: Decide, rule: Rule, distances: np.ndarray, keys: jax.Array, scene: Scene, poses: Array, missed: Array
 ) -> Choice:
     """`decide` on all tables `[B]`."""
     choose: Choice = clutter.in_few(
-        functools.partial(_choices, decide=decide, rule=rule, distances=distances), keys, scene, poses
+        functools.partial(_choices, decide=decide, rule=rule, distances=distances), keys, scene, poses, missed
     )
     return choose
 
@@ -191,6 +192,7 @@ def _choices(
     keys: jax.Array,
     scene: Scene,
     poses: jax.Array,
+    missed: jax.Array,
     real: jax.Array,
     *,
     decide: Decide,
@@ -199,12 +201,12 @@ def _choices(
 ) -> Choice:
     """Choices of the tables that are real, one after another: a decision is itself a batch of images."""
 
-    def one(key: jax.Array, scene: Scene, poses: jax.Array) -> Choice:
+    def one(key: jax.Array, scene: Scene, poses: jax.Array, missed: jax.Array) -> Choice:
         seen = render.render(scene, poses)
-        return choices.choice(seen, decide(key, seen, distances, rule))
+        return choices.choice(seen, decide(key, seen, missed, distances, rule))
 
-    def some(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Choice:
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, *args[:3]))
-        return jax.lax.cond(args[3], lambda: one(*args[:3]), lambda: nothing)
+    def some(args: tuple[jax.Array, Scene, jax.Array, jax.Array, jax.Array]) -> Choice:
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, *args[:4]))
+        return jax.lax.cond(args[4], lambda: one(*args[:4]), lambda: nothing)
 
-    return jax.lax.map(some, (keys, scene, poses, real))
+    return jax.lax.map(some, (keys, scene, poses, missed, real))

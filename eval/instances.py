@@ -30,6 +30,7 @@ class Instance:
     held: int = 0  # grasps that held something
     ended: str = ""  # cleared, pushed out, out of actions, fault
     did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action
+    missed: tuple[np.ndarray, ...] = ()  # grasps [3] that missed and around which nothing has moved since
     film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # what preceded each action
 
     @property

@@ -24,6 +24,7 @@ def decide(
     keys: jax.Array,
     scene: Scene,
     poses: Array,
+    missed: Array,
 ) -> Choice:
     """Choices for the tables `[B]`: Alg. 2 with the engine as predictor, which knows shapes but guesses what is unseen.
 
@@ -36,9 +37,10 @@ def decide(
       keys: `[B]` random keys, for the candidates.
       scene: `[B, N]`; masses and frictions are replaced by nominal ones.
       poses: `[B, N, 7]`.
+      missed: `[B, M, 3]` grasps that missed.
     """
     propose = functools.partial(_proposals, scorer=scorer, rule=rule, distances=distances)
-    proposals = clutter.in_few(propose, keys, scene, poses)
+    proposals = clutter.in_few(propose, keys, scene, poses, missed)
     motion = _motions(engine, scene, poses, proposals, float(max(distances)))
     choose = functools.partial(_chosen, appraise=appraise, rule=rule)
     chosen: Choice = clutter.in_few(choose, scene, poses, proposals, motion)
@@ -50,19 +52,20 @@ def _proposals(
     keys: jax.Array,
     scene: Scene,
     poses: jax.Array,
+    missed: jax.Array,
     real: jax.Array,
     *,
     scorer: planner.Scorer,
     rule: Rule,
     distances: jax.Array,
 ) -> Proposal:
-    def one(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Proposal:
-        key, scene, poses, wanted = args
-        slots, seen = scene.shape.shape[0], render.render(scene, poses)
-        found = planner.propose(key, seen, scorer, rule, count=len(distances), slots=slots, distance=distances)
+    def one(args: tuple[jax.Array, Scene, jax.Array, jax.Array, jax.Array]) -> Proposal:
+        key, scene, poses, missed, wanted = args
+        options = {"count": len(distances), "slots": scene.shape.shape[0], "distance": distances, "missed": missed}
+        found = planner.propose(key, render.render(scene, poses), scorer, rule, **options)
         return found.replace(settled=found.settled | ~wanted)
 
-    return jax.lax.map(one, (keys, scene, poses, real))
+    return jax.lax.map(one, (keys, scene, poses, missed, real))
 
 
 def _motions(engine: Engine, scene: Scene, poses: Array, proposals: Proposal, longest: float) -> np.ndarray:

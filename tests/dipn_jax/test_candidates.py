@@ -115,6 +115,17 @@ def test_the_best_grasps_stand_apart() -> None:
     np.testing.assert_array_equal(candidates.best_grasps(scores, count=2), [[0, 10, 10], [2, 40, 40]])
 
 
+def test_grasps_like_one_that_missed_are_doubted() -> None:
+    scores = jnp.full((16, 64, 64), 0.8)
+    missed = np.array([[15, 30, 20], [15, 30, 24], [-1, -1, -1]])
+    found = np.asarray(candidates.doubted(scores, missed))
+    for rotation, row, col, share in ((15, 30, 20, 4), (7, 30, 20, 4), (0, 30, 20, 4), (6, 30, 20, 4), (1, 30, 20, 1)):
+        assert found[rotation, row, col] == pytest.approx(0.8 / share)
+    for row, col, share in ((30, 33, 2), (41, 20, 1), (30, 12, 2), (23, 30, 2)):
+        assert found[15, row, col] == pytest.approx(0.8 / share), (row, col)
+    np.testing.assert_array_equal(candidates.doubted(scores, np.full((2, 3), -1)), scores)
+
+
 def test_a_push_can_begin_where_the_footprint_is_free(settled: Any) -> None:
     seen = _seen(settled)
     possible = np.asarray(candidates.pushable(seen.height))

@@ -1,5 +1,6 @@
 """Methods that clear tables: who needs what, decisions in lockstep, sweeps."""
 
+import dataclasses
 import pathlib
 from typing import Any
 
@@ -8,13 +9,13 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import cases, checkpoint, scenes, structs
+from dipn_jax import cases, checkpoint, planner, scenes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
-from eval import clearing_cli, deciding, metrics, sweeping
-from eval.instances import Tables
+from eval import clearing, clearing_cli, deciding, metrics, sweeping
+from eval.instances import Instance, Tables
 
 CONFIGS: dict[str, tuple[str, Any]] = {
     "push": ("dipn", DipnConfig(width=8)),
@@ -46,14 +47,41 @@ def test_every_method_decides_on_every_table_by_itself(
     decide = deciding.load(plan, _nets(runs), engine, slots=5)
     keys = jax.random.split(jax.random.key(0), 3)
     scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]
-    together = decide(keys, scene, poses)
+    none = np.tile(planner.NONE_MISSED, (3, 4, 1))
+    together = decide(keys, scene, poses, none)
     assert together.is_push.shape == (3,) and together.motion.shape == (3, 5, 3)
-    alone = decide(keys[1:2], structs.take(scene, slice(1, 2)), poses[1:2])
+    alone = decide(keys[1:2], structs.take(scene, slice(1, 2)), poses[1:2], none[1:2])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a[1:2], b, atol=1e-6), together, alone)
+    missed = np.concatenate([none[:, 1:], together.grasp_pixel[:, None]], 1)
+    doubting = decide(keys, scene, poses, missed)
+    assert (doubting.values[:, 0] < together.values[:, 0]).all() and (doubting.grasp_pixel != missed[:, -1]).any()
     if method == "gn":
         assert not together.is_push.any()
     if method == "physics+gn":
         assert np.abs(together.motion).max() > 0.01, "the engine was not asked, or moved nothing"
+
+
+def test_a_miss_is_kept_in_mind_until_something_near_it_moves(settled: Any) -> None:
+    poses = np.array(settled.poses[0], np.float32)
+    poses[:, :2] = [[0, 0], [0.1, 0], [-0.1, 0], [0, 0.1], [0, -0.1]]
+    made = Instance("one", structs.take(settled.scene, 0), poses, 5)
+    made = dataclasses.replace(made, scene=made.scene.replace(shape=np.zeros(5, np.int32)))
+
+    def act(did: str, pixel: tuple[int, int, int] = (0, 0, 0), moved: tuple[int, float] = (0, 0.0)) -> int:
+        before = made.scene.shape, made.poses
+        made.poses = made.poses.copy()
+        made.poses[moved[0], 0] += moved[1]
+        made.did.append(did)
+        clearing._doubt(made, before, np.array(pixel, np.int32))
+        return int((clearing._missed(made)[:, 0] >= 0).sum())
+
+    assert act("grasp missed", (3, 112, 112)) == 1
+    assert act("grasp missed", (3, 112, 162)) == 2  # at the second object
+    assert act("push", moved=(3, 0.05)) == 2  # 10 cm away from both
+    assert act("grasp held", moved=(1, 0.006)) == 1
+    np.testing.assert_array_equal(clearing._missed(made)[0], [3, 112, 112])
+    assert act("grasp missed", (5, 112, 112), moved=(0, 0.02)) == 0, "it moved what it missed"
+    assert [act("grasp missed", (i, 112, 112)) for i in range(10)][-1] == clearing.MISSES
 
 
 def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pathlib.Path]) -> None:
