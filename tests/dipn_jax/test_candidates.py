@@ -77,7 +77,7 @@ def test_random_grasps_lie_on_objects_at_the_height_below_them(settled: Any) -> 
     height = np.asarray(seen.height)[pixel[:, 1], pixel[:, 0]]
     assert (np.asarray(seen.label)[pixel[:, 1], pixel[:, 0]] >= 0).all()
     deepest = np.maximum(height - 0.04, 0.02)
-    highest = np.maximum(height - 0.015, deepest + 0.003)
+    highest = np.maximum(height - 0.015, deepest + 0.004)
     assert ((grasps.height > deepest - 1e-6) & (grasps.height < highest + 1e-6)).all()
     steps = np.asarray(grasps.angle) / (np.pi / 8)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-4)
@@ -160,7 +160,7 @@ def test_the_hand_stops_on_what_a_finger_meets() -> None:
     assert tip(0.05, 0.025) == pytest.approx(0.026)
     assert tip(0.05, 0.025, rotation=4) == pytest.approx(0.02)  # closing along the rows it is not met
     assert tip(0.05, 0.06) == pytest.approx(0.035)  # as deep as it must
-    assert tip(0.025, 0.025) == pytest.approx(0.023)  # low things: a little short
+    assert tip(0.025, 0.025) == pytest.approx(0.024)  # low things: a little short
     assert tip(0.09, 0.04) == pytest.approx(0.05)  # goes by far over it
 
 
@@ -169,7 +169,7 @@ def test_what_reaches_the_border_goes_on_beyond_it() -> None:
     height[100:125, 180:] = 0.03
     across = np.array([[0, 112, 200], [4, 112, 200]])  # a finger outside the map; none
     found = jax.vmap(candidates.grasp_at, in_axes=(0, None))(jnp.asarray(across), jnp.asarray(height)).height
-    np.testing.assert_allclose(found, [0.023, 0.02], atol=1e-6)
+    np.testing.assert_allclose(found, [0.024, 0.02], atol=1e-6)
 
 
 def test_what_fingers_come_down_on_is_where_the_simulated_fingers_are(settled: Any, rng: np.random.Generator) -> None:
