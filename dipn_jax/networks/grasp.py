@@ -31,6 +31,8 @@ BLOCKED = 0.02
 """Metres by which something under a finger stands over where its tip is to go: it can rarely push that aside."""
 WALL = 1.0
 """Metres: what an object at the border of the image is taken for beyond it, where nobody sees it."""
+HIDDEN = 12
+"""Pixels along the border by which such an object may be wider out of sight: half a large one."""
 BLOCK = 4
 """Pixels a side of a cell: the compact network works on cells."""
 FINGER_COLUMNS = tuple(
@@ -264,12 +266,14 @@ def label_image(height: jax.Array) -> jax.Array:
 def blocked_image(height: jax.Array) -> jax.Array:
     """Which grasps on a height map `[224, 224]` a finger stops short of: `[16, 224, 224]`, 1 where so, else 0.
 
-    It would come down on something that stands BLOCKED over where its tip is to go, or out of sight where what
-    reaches the border may go on.
+    It would come down on something that stands BLOCKED over where its tip is to go, or out of sight near something
+    that reaches the border.
     """
     height = jnp.pad(height, (VIEW - WORKSPACE.pixels) // 2, mode="edge")
     outside = jnp.abs(jnp.arange(VIEW) - (VIEW - 1) / 2) > WORKSPACE.pixels / 2
-    height = jnp.where((outside[:, None] | outside) & (height > EMPTY), WALL, height)
+    beyond = jnp.where(outside[:, None] | outside, height, 0.0)
+    hidden = jax.lax.reduce_window(beyond, 0.0, jax.lax.max, (2 * HIDDEN + 1,) * 2, (1, 1), "SAME") > EMPTY
+    height = jnp.where((outside[:, None] | outside) & hidden, WALL, height)
     return _of_every_grasp(height, lambda turned: (_under_fingers(turned) > _tip(turned) + BLOCKED).astype(jnp.float32))
 
 

@@ -264,6 +264,9 @@ def test_a_finger_that_would_land_on_something_tall_makes_a_grasp_doubtful() -> 
     assert not np.asarray(grasp.blocked_image(high))[:, 112, 112].any()  # the tips go to 40 mm
     cut = np.asarray(grasp.blocked_image(jnp.zeros((224, 224)).at[100:125, 195:].set(0.03)))
     assert cut[0, 112, 205] and not cut[0, 112, 190] and not cut[4, 112, 205]  # one finger would be out of sight
+    assert cut[0, 140, 205] and not cut[0, 150, 205]  # 22 mm and 42 mm beside what is seen of it, a pad's half less
+    inside = np.asarray(grasp.blocked_image(jnp.zeros((224, 224)).at[100:125, 190:218].set(0.03)))
+    assert not inside[0, 112].any()
     model = grasp.GraspNet(grasp.GraspConfig(width=8, coarse=8, blocks=1), rngs=nnx.Rngs(0))
     model.eval()
     images = [jnp.zeros((224, 224, 4)).at[..., 3].set(height) for height in (tall, low)]
