@@ -146,8 +146,8 @@ clear-figures: setup
 	  $$large --method physics+gn --grasp-net builtin --out $(ON)/physics-gn-$$on || exit; \
 	done
 	$(BIN)/dipn-eval report --clear $(ON)/* --out $(CLEAR)
-	$(BIN)/python docs/clearing.py $(ON)
 	$(BIN)/dipn-eval sweep --push-net builtin --grasp-net builtin --distances 0.03:0.12:0.01 --instances 3 --out $(CLEAR)/sweep
+	$(BIN)/python docs/clearing.py $(ON) $(CLEAR)/sweep
 
 clean-demo:
 	rm -rf $(DEMO)

@@ -101,6 +101,7 @@ def _all(decide: Callable[[Observation, int], Decision], tables: list[Observatio
 
 def _imagined(seen: Observation, slots: int, count: int, predictor: Any) -> Callable[[int], jax.Array]:
     """The image after candidate `i`, each predicted by itself."""
+    seen = jax.tree.map(jnp.asarray, seen)
     pushes, _ = candidates.sample_pushes(jax.random.key(0), seen, count=count, slots=slots, distance=0.1)
 
     @jax.jit

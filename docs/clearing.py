@@ -1,6 +1,7 @@
-"""The figures of docs/clearing.md: `python docs/clearing.py RESULTS` after the commands on that page.
+"""The figures of docs/clearing.md: `python docs/clearing.py RESULTS SWEEP` after the commands on that page.
 
-Gathers RESULTS/*/metrics.json of `dipn-eval clear` in docs/clearing.json, and prints the tables.
+Gathers RESULTS/*/metrics.json of `dipn-eval clear` in docs/clearing.json and SWEEP/metrics.json of `dipn-eval sweep` in
+docs/sweep.json, and prints the tables.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import sys
 from typing import Any
 
 from dipn_jax import console, files
-from eval import comparison, paper
+from eval import comparison, paper, sweeping
 
 DOCS = pathlib.Path(__file__).parent
 TITLES = {
@@ -46,12 +47,28 @@ def tables(values: dict[str, Any]) -> list[str]:
     return [table(values, kind) for kind in sorted({key.split("/")[1] for key in values})]
 
 
+def swept(values: dict[str, Any]) -> str:
+    """What `dipn-eval sweep` found at each distance, %; prediction errors are true 1-IoU of objects that move."""
+    lines = ["| push | error, moved objects | completion | grasp success | efficiency | pushes |", "| --- " * 6 + "|"]
+    for each in sweeping.names(values):
+        at = f"sweep/{each}"
+        error = values.get(f"{at}/push_error/moved")
+        name = each if error is None else f"{100 * float(each):.0f} cm"
+        cells = [_cell(values, f"{at}/{key}") for key in sweeping.SHOWN]
+        lines.append(
+            f"| {name} | {'-' if error is None else f'{error:.3f}'} | {' | '.join(cells)} | {values[f'{at}/pushes']} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     """Entry point."""
     folders = sorted(path.parent for path in pathlib.Path(sys.argv[1]).glob("*/metrics.json"))
     values = comparison.flat([comparison.Cleared(folder) for folder in folders])
     files.write_json(DOCS / "clearing.json", values)
-    for each in tables(values):
+    sweep = files.read_json(pathlib.Path(sys.argv[2]) / "metrics.json")
+    files.write_json(DOCS / "sweep.json", {key: value for key, value in sweep.items() if key.startswith("sweep/")})
+    for each in (*tables(values), swept(sweep)):
         console.say(each)
 
 

@@ -127,7 +127,7 @@ def _errors(
     return jax.lax.map(one, (seen, pushes, scene, before, after))
 
 
-def _names(values: dict[str, Any]) -> list[str]:
+def names(values: dict[str, Any]) -> list[str]:
     """What was swept, in order, the choosing policy last."""
     found = {key.split("/")[1] for key in values if key.startswith("sweep/")}
     return [*sorted(found - {CHOSEN}, key=float), *(found & {CHOSEN})]
@@ -137,7 +137,7 @@ def table(values: dict[str, Any]) -> str:
     """An HTML table of a sweep."""
     head = ["metres", "prediction error, moved", *[f"{key.replace('_', ' ')} %" for key in SHOWN], "pushes"]
     rows = []
-    for each in _names(values):
+    for each in names(values):
         at = f"sweep/{each}"
         error = values.get(f"{at}/push_error/moved")
         cells = [drawing.percent(values, f"{at}/{key}") for key in SHOWN]
@@ -147,7 +147,7 @@ def table(values: dict[str, Any]) -> str:
 
 def figure(values: dict[str, Any]) -> Any:
     """Prediction error, completion, grasp success and efficiency against distance; the choosing policy as a line."""
-    each = [one for one in _names(values) if one != CHOSEN]
+    each = [one for one in names(values) if one != CHOSEN]
     x = [100 * float(one) for one in each]
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.2))
     panels = ("push_error/moved", *SHOWN)

@@ -15,3 +15,4 @@ def test_the_page_in_docs_shows_the_figures_in_docs() -> None:
     texts = [path.read_text() for path in (DOCS / "clearing.md", DOCS.parent / "README.md")]
     for table in page.tables(json.loads((DOCS / "clearing.json").read_text())):
         assert all(table in text for text in texts)
+    assert page.swept(json.loads((DOCS / "sweep.json").read_text())) in texts[0]
