@@ -81,17 +81,17 @@ def speed(setting: Setting) -> Iterator[tuple[str, float]]:
         decide = _decider("compact", slots, count, fast=True)
         decide(tables[0], 0)
         taken = seconds(functools.partial(_all, decide, tables)) / len(tables)
-        yield f"decide.speed/compact/{count}", taken
+        yield f"decide.speed/compact_{count}", taken
     few = setting.pick(2, 4)
     each = _paper_one_by_one(tables[0], slots, few)
     whole = _paper_whole(tables[0], slots, few)
     for count in COUNTS:
-        yield f"decide.speed/paper/{count}", whole * (1 + count)
+        yield f"decide.speed/paper_{count}", whole * (1 + count)
     decide = _decider("compact", slots, 64, fast=True)
     decide(tables[0], 0)
     ours = seconds(lambda: _all(decide, tables)) / len(tables)
-    yield "decide.speed/paper_one_by_one/64", each * 65
-    yield "decide.speed/times_paper_one_by_one", each * 65 / ours
+    yield "decide.speed/paper_one_by_one_64", each * 65
+    yield "decide.speed", each * 65 / ours
 
 
 def _all(decide: Callable[[Observation, int], Decision], tables: list[Observation]) -> None:
@@ -161,7 +161,7 @@ def fast_path(setting: Setting) -> Iterator[tuple[str, float]]:
         total += each
         sides = [functools.partial(_all, decide, tables[:4]) for decide in (plain, fast)]
         slow, quick = alternate(*sides, repeats=3)
-        name = f"packed_{objects}" if packed else objects
+        name = f"packed_{objects}" if packed else f"random_{objects}"
         yield f"decide.fast_path/times/{name.replace(':', '_')}", slow / quick
     yield "decide.fast_path/scenes", total
     yield "decide.fast_path", same / total
