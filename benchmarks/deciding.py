@@ -32,7 +32,7 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import VIEW, GraspConfig
 from dipn_jax.physics import make_engine
 from dipn_jax.structs import Decision, Observation, Push
-from dipn_jax.workspace import ROTATIONS, grasp_angles
+from dipn_jax.workspace import grasp_angles
 from eval import clearing, deciding, instances
 
 BUILTIN = pathlib.Path("builtin")
@@ -129,7 +129,7 @@ def _paper_one_by_one(seen: Observation, slots: int, count: int) -> float:
     def work() -> None:
         for i in range(count):
             image = image_after(i)
-            np.mean([float(rotation(image, angle)) for angle in grasp_angles()[:ROTATIONS]])
+            np.mean([float(rotation(image, angle)) for angle in grasp_angles()])
 
     work()
     return seconds(work) / count
@@ -151,20 +151,22 @@ def _paper_whole(seen: Observation, slots: int, count: int) -> float:
 
 def fast_path(setting: Setting) -> Iterator[tuple[str, float]]:
     """How often the fast path decides as the plain one, and how many times faster it is, with 64 candidates."""
-    each, same, total = setting.pick(10, 125), 0, 0
+    each, same, pushed = setting.pick(10, 125), [], []
     for objects, packed in KINDS:
         seen, slots = _seen(objects, each, setting.seed, packed=packed)
         plain, fast = (_decider("compact", slots, 64, fast=quick) for quick in (False, True))
         tables = [structs.take(seen, i) for i in range(each)]
         pairs = [(plain(table, i), fast(table, i)) for i, table in enumerate(tables)]
-        same += sum(_same(*pair) for pair in pairs)
-        total += each
+        same += [_same(*pair) for pair in pairs]
+        pushed += [bool(slow.is_push) for slow, _ in pairs]
         sides = [functools.partial(_all, decide, tables[:4]) for decide in (plain, fast)]
         slow, quick = alternate(*sides, repeats=3)
         name = f"packed_{objects}" if packed else f"random_{objects}"
         yield f"decide.fast_path/times/{name.replace(':', '_')}", slow / quick
-    yield "decide.fast_path/scenes", total
-    yield "decide.fast_path", same / total
+    yield "decide.fast_path/scenes", len(same)
+    yield "decide.fast_path/pushes", sum(pushed)
+    yield "decide.fast_path/same_of_pushes", float(np.mean(np.array(same)[pushed])) if any(pushed) else 1.0
+    yield "decide.fast_path", float(np.mean(same))
 
 
 def _same(plain: Decision, fast: Decision) -> bool:
