@@ -134,9 +134,10 @@ def load_predictor(run: pathlib.Path, slots: int) -> Predictor:
     return dipn_predictor(checkpoint.load_network(run, network="dipn"), slots)  # type: ignore[arg-type]
 
 
-def load_scorer(run: pathlib.Path) -> Scorer:
-    """The scorer of a `dipn-train grasp` run."""
-    return grasp_scorer(checkpoint.load_network(run, network="grasp"))  # type: ignore[arg-type]
+def load_scorer(run: pathlib.Path, *, cautious: bool = True) -> Scorer:
+    """The scorer of a `dipn-train grasp` run, to act on."""
+    model: Any = checkpoint.load_network(run, network="grasp")
+    return grasp_scorer(model) if cautious else plain_scorer(model)
 
 
 def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
@@ -156,7 +157,11 @@ def load_values(run: pathlib.Path) -> tuple[Scorer | None, Scorer | None]:
     return value_scorers(checkpoint.load_network(run, network="vpg"))  # type: ignore[arg-type]
 
 
-def load_appraiser(run: pathlib.Path, *, network: str = "grasp") -> Appraiser:
-    """What all grasps on imagined images are worth to the network of a run: GN, or the grasps of a baseline (`vpg`)."""
+def load_appraiser(run: pathlib.Path, *, network: str = "grasp", whole: bool = False) -> Appraiser:
+    """What all grasps on imagined images are worth to the network of a run: GN, or the grasps of a baseline (`vpg`).
+
+    Every image is scored `whole`, or the fast way where there is one, which does not tell the best score on each.
+    """
     model: Any = checkpoint.load_network(run, network=network)
-    return grasp_appraiser(model.grasp if network == "vpg" else model)
+    grasps = model.grasp if network == "vpg" else model
+    return planner.plain(plain_scorer(grasps)) if whole else grasp_appraiser(grasps)

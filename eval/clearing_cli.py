@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from dipn_jax import checkpoint, console, policy, resume, scenes
+from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine, EngineName, make_engine
 from eval import clearing, deciding, metrics, options, sweeping
 from eval.instances import Tables
@@ -33,6 +34,8 @@ def clear(
     gamma: float = 0.9,
     threshold: float = 0.7,
     released: bool = False,
+    cautious: bool = True,
+    remember: bool = True,
     label: str = "",
     seed: int = 1_000_000,
     engine: EngineName = "auto",
@@ -59,6 +62,9 @@ def clear(
       threshold: grasp at once above this score.
       released: decide by the clauses of DIPN's released code, too: a lone object is grasped, a push must raise the best
         score, gamma discounts only pushes after which that is over 0.5, and no object may come near the edge.
+      cautious: GN's score of a grasp is the least of what it says of the grasp and its mirror images, and is halved
+        where the height map speaks against it; no: as published. Means of imagined images are as published anyway.
+      remember: halve the scores of grasps like one that missed until something near them moves; no: as published.
       label: what sets this apart from others of the same method, for the report: the data learnt from, say.
       seed: of scenes, perturbations and candidates.
       engine: physics.
@@ -66,6 +72,7 @@ def clear(
     settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
     del settings["tables"]
     plan = _plan(out, seed, method, candidates, (distance,), gamma, threshold, released)
+    plan = dataclasses.replace(plan, cautious=cautious, remember=remember)
     nets, physics = deciding.Nets(push_net, grasp_net, value_net), make_engine(engine)
     decide = deciding.load(plan, nets, physics, slots=tables.slots())
     _cleared(out, decide, physics, tables, settings, nets.require(method), longest=max(distance, LONG))
@@ -126,6 +133,8 @@ def sweep(
     del settings["tables"]
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
+    if candidates < len(every):
+        raise UserError(f"--candidates {candidates}: want at least one for each of the {len(every)} distances")
     each = {sweeping.name(distance): (distance,) for distance in every} | {sweeping.CHOSEN: every}
     plans = [_plan(out, seed, "dipn+gn", candidates, spread, gamma, threshold, False) for spread in each.values()]
     nets = deciding.Nets(push_net, grasp_net)

@@ -18,7 +18,8 @@ FRAMES = 10
 FILM_ROWS = 4
 CAUSES = {
     "cleared": "cleared",
-    "pushed out": "an object left the workspace",
+    "pushed out": "pushed out of the workspace",
+    "thrown out": "thrown out by a grasp",
     "out of actions": "more than three actions an object",
     "fault": "the simulation went wrong",
 }
@@ -33,7 +34,7 @@ class Cleared:
         settings = files.read_json(folder / "settings.json")
         self.method, self.label = settings["method"], settings["label"]
         cases = settings["tables.cases"]
-        self.tables = f"random-{settings['tables.objects']}" if cases == "random" else pathlib.Path(cases).stem
+        self.tables = _tables_name(cases, settings["tables.objects"])
         self.episodes = files.read_json(folder / "episodes.json", wanted=list)
 
     @property
@@ -87,11 +88,27 @@ def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> s
     return drawing.table(head, lines)
 
 
+def _cause(one: Cleared, entry: dict[str, Any]) -> str:
+    """Why a table ended, of CAUSES: an object leaves the workspace at a push or at a grasp."""
+    ended = str(entry["ended"])
+    grasped = ended == "pushed out" and str(film.load(one.folder / entry["file"]).what[-1]) != "push"
+    return "thrown out" if grasped else ended
+
+
+def _tables_name(cases: str, objects: str) -> str:
+    """What a table of results is called: the hard instances, random-N, or a case file of the user's own."""
+    if cases in ("hard", "random"):
+        return cases if cases == "hard" else f"random-{objects}"
+    stem = pathlib.Path(cases).stem
+    return f"own-{stem}" if stem in paper.TABLE else stem
+
+
 def _causes(rows: list[Cleared]) -> str:
     """How every table ended, and on which cases it was not cleared."""
     lines = []
     for one in rows:
-        counts = [str(one.values[f"ended_{cause.replace(' ', '_')}"]) for cause in CAUSES]
+        causes = [_cause(one, entry) for entry in one.episodes]
+        counts = [str(causes.count(cause)) for cause in CAUSES]
         failed = [entry["name"] for entry in one.episodes if entry["ended"] != "cleared"]
         where = ", ".join(f"{name} ({failed.count(name)})" for name in sorted(set(failed)))
         lines.append([one.name, *counts, where or "-"])

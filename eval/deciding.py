@@ -49,6 +49,8 @@ class Plan:
     gamma: float = 0.9
     threshold: float = 0.7
     released: bool = False  # with the clauses of DIPN's released code
+    cautious: bool = True  # GN's scores are the least of four answers; False: GN as published
+    remember: bool = True  # grasps like one that missed are doubted until something near moves
 
     def __post_init__(self) -> None:
         if self.method not in get_args(MethodName):
@@ -111,14 +113,32 @@ def load_each(plans: list[Plan], nets: Nets, engine: Engine, *, slots: int) -> l
     plan = plans[0]
     runs = nets.require(plan.method)
     if plan.method == "gn":
-        return [best_grasp(policy.load_scorer(runs["grasp"]), slots=slots)] * len(plans)
+        grasp = best_grasp(policy.load_scorer(runs["grasp"], cautious=plan.cautious), slots=slots)
+        return [_minding(each, grasp) for each in plans]
     made: Callable[..., Choice]
     if plan.method == "physics+gn":
-        scorer, appraise = policy.load_scorer(runs["grasp"]), policy.load_appraiser(runs["grasp"])
+        scorer, appraise = _gn(plan, runs["grasp"])
         made = functools.partial(rollouts.decide, scorer, appraise, engine)
     else:
         made = functools.partial(_in_lockstep, _decide(plan, runs, slots))
-    return [functools.partial(made, each.rule(), each.spread()) for each in plans]
+    return [_minding(each, functools.partial(made, each.rule(), each.spread())) for each in plans]
+
+
+def _gn(plan: Plan, run: pathlib.Path) -> tuple[planner.Scorer, planner.Appraiser]:
+    """What grasps GN takes, and what it thinks of images.
+
+    The clauses of the released code look at the best score on every image, which the fast way does not tell.
+    """
+    return policy.load_scorer(run, cautious=plan.cautious), policy.load_appraiser(run, whole=plan.released)
+
+
+def _minding(plan: Plan, decide: Decider) -> Decider:
+    """`decide`, told of no grasp that missed where the plan is not to remember any."""
+
+    def forget(keys: jax.Array, scene: Scene, poses: Array, missed: Array) -> Choice:
+        return decide(keys, scene, poses, np.broadcast_to(planner.NONE_MISSED[0], np.shape(missed)))
+
+    return decide if plan.remember else forget
 
 
 def best_grasp(scorer: planner.Scorer, *, slots: int) -> Decider:
@@ -138,9 +158,12 @@ def _decide(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
         return _compare(plan, runs, slots)
     predictor = policy.load_predictor(runs["push"], slots)
     if plan.method == "rea+dipn":
-        scorer, appraise = _part(runs["value"], "grasp"), policy.load_appraiser(runs["value"], network="vpg")
+        scorer, appraise = (
+            _chances(runs["value"]),
+            policy.load_appraiser(runs["value"], network="vpg", whole=plan.released),
+        )
     else:
-        scorer, appraise = policy.load_scorer(runs["grasp"]), policy.load_appraiser(runs["grasp"])
+        scorer, appraise = _gn(plan, runs["grasp"])
 
     def imagine(key: jax.Array, seen: Observation, missed: jax.Array, distances: jax.Array, rule: Rule) -> Decision:
         options: dict[str, Any] = {"count": plan.candidates, "slots": slots, "distance": distances, "rule": rule}
@@ -153,7 +176,7 @@ def _compare(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
     """As `_decide`, of a method that imagines nothing."""
     pushes = _part(runs["value"], "push")
     with_gn = plan.method == "dqn+gn"
-    scorer = policy.load_scorer(runs["grasp"]) if with_gn else _part(runs["value"], "grasp")
+    scorer = policy.load_scorer(runs["grasp"], cautious=plan.cautious) if with_gn else _part(runs["value"], "grasp")
 
     def compare(_: jax.Array, seen: Observation, missed: jax.Array, distances: jax.Array, rule: Rule) -> Decision:
         threshold = rule.threshold if with_gn else jnp.inf
@@ -161,6 +184,20 @@ def _compare(plan: Plan, runs: dict[str, pathlib.Path], slots: int) -> Decide:
         return planner.compare(seen, pushes, scorer, **options)
 
     return compare
+
+
+def _chances(run: pathlib.Path) -> planner.Scorer:
+    """The scorer of the grasps of REA.
+
+    Raises:
+      UserError: the run answers with values: means of them, and 0.7, would mean nothing.
+    """
+    model: Any = checkpoint.load_network(run, network="vpg")
+    if model.config.answers != "chance":
+        raise UserError(
+            f"--value-net {run}: has learnt values, not chances; give a run of dipn-train baseline --method rea"
+        )
+    return _part(run, "grasp")
 
 
 def _part(run: pathlib.Path, name: str) -> planner.Scorer:

@@ -15,6 +15,11 @@ from dipn_jax.errors import UserError
 from dipn_jax.physics import Engine
 from dipn_jax.structs import Fault, Scene
 
+JITTER = 0.002
+"""Metres by which an object of a repeated case is moved at most."""
+MASS_FACTOR, FRICTION_FACTOR = (0.8, 1.2), (0.85, 1.15)
+"""By which those of its objects are multiplied."""
+
 
 @dataclasses.dataclass
 class Instance:
@@ -41,7 +46,9 @@ class Instance:
 def hard_instances(
     engine: Engine, path: pathlib.Path, names: list[str] | None, *, slots: int, repeats: int, seed: int
 ) -> list[Instance]:
-    """The cases of a file, settled; `repeats` of each, all but the first moved by up to 2 mm and reweighed.
+    """The cases of a file, settled; `repeats` of each, all but the first moved by up to JITTER and reweighed.
+
+    A repeat of a case is the same however many others there are.
 
     Raises:
       UserError: a name is not in the file.
@@ -53,14 +60,15 @@ def hard_instances(
         raise UserError(f"cases {missing}: not in {path}; it has {found}")
     index = np.array([found.index(name) for name in wanted for _ in range(repeats)])
     scene, poses = structs.take(scene, index), poses[index].copy()
-    rng = np.random.default_rng(seed)
-    varied = np.arange(len(index)) % repeats > 0
-    poses[varied, :, :2] += rng.uniform(-0.002, 0.002, poses[varied, :, :2].shape)
-    factor = np.where(varied[:, None], rng.uniform(0.8, 1.2, scene.mass.shape), 1.0)
-    rub = np.where(varied[:, None], rng.uniform(0.85, 1.15, scene.mass.shape), 1.0)
-    scene = scene.replace(
-        mass=(scene.mass * factor).astype(np.float32), friction=(scene.friction * rub).astype(np.float32)
-    )
+    mass, friction = np.array(scene.mass), np.array(scene.friction)
+    for row, case in enumerate(index):
+        if repeat := row % repeats:
+            rng = np.random.default_rng([seed, case, repeat])
+            reach, angle = JITTER * np.sqrt(rng.uniform(size=slots)), rng.uniform(0, 2 * np.pi, slots)
+            poses[row, :, :2] += reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+            mass[row] *= rng.uniform(*MASS_FACTOR, slots)
+            friction[row] *= rng.uniform(*FRICTION_FACTOR, slots)
+    scene = scene.replace(mass=mass, friction=friction)
     rollout = primitives.settle(engine, scene, poses)
     wrong = np.flatnonzero(np.asarray(rollout.fault) & (Fault.UNUSABLE | Fault.OUTSIDE))
     if len(wrong):
@@ -101,6 +109,8 @@ class Tables:
 
     def __post_init__(self) -> None:
         console.require_positive(instances=self.instances)
+        if self.names and self.cases == "random":
+            raise UserError("--names: random tables have none; give --cases hard or a case file")
 
     def path(self) -> pathlib.Path | None:
         """The case file, if there is one."""

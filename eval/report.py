@@ -143,8 +143,9 @@ def _curves(runs: list[pathlib.Path]) -> Any:
             lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
         except (OSError, json.JSONDecodeError):
             raise UserError(f"{run}: no readable metrics.jsonl; give the --out of a dipn-train command") from None
-        for key in [k for k in (lines[0] if lines else {}) if k != "step"]:
-            axis.plot([line["step"] for line in lines], [line[key] for line in lines], marker=".", label=key)
+        for key in dict.fromkeys(k for line in lines for k in line if k != "step"):
+            some = [line for line in lines if key in line]
+            axis.plot([line["step"] for line in some], [line[key] for line in some], marker=".", label=key)
         axis.set(title=run.name, xlabel="steps", yscale="log")
         axis.legend(fontsize=7)
         axis.grid(alpha=0.3)

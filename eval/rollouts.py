@@ -10,7 +10,8 @@ import numpy as np
 from dipn_jax import candidates, clutter, geometry, planner, primitives, render, scenes, structs
 from dipn_jax.physics import Engine
 from dipn_jax.planner import Proposal, Rule
-from dipn_jax.structs import Array, Scene
+from dipn_jax.structs import Array, Fault, Scene
+from dipn_jax.workspace import PUSH_STEPS
 from eval import choices
 from eval.choices import Choice
 
@@ -41,7 +42,8 @@ def decide(
     """
     propose = functools.partial(_proposals, scorer=scorer, rule=rule, distances=distances)
     proposals = clutter.in_few(propose, keys, scene, poses, missed)
-    motion = _motions(engine, scene, poses, proposals, float(max(distances)))
+    motion, believed = _motions(engine, scene, poses, proposals, max(float(max(distances)), PUSH_STEPS * 0.01))
+    proposals = proposals.replace(feasible=proposals.feasible & believed)
     choose = functools.partial(_chosen, appraise=appraise, rule=rule)
     chosen: Choice = clutter.in_few(choose, scene, poses, proposals, motion)
     return chosen
@@ -68,11 +70,16 @@ def _proposals(
     return jax.lax.map(one, (keys, scene, poses, missed, real))
 
 
-def _motions(engine: Engine, scene: Scene, poses: Array, proposals: Proposal, longest: float) -> np.ndarray:
-    """Motions `[B, P, N, 3]` of the pushes that matter, as the engine with nominal masses and frictions has them."""
+def _motions(
+    engine: Engine, scene: Scene, poses: Array, proposals: Proposal, longest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motions `[B, P, N, 3]` of the pushes that matter, as the engine with nominal masses and frictions has them.
+
+    And which of their simulations can be believed, `[B, P]` bool.
+    """
     asked = proposals.feasible & ~proposals.settled[:, None]
     table, which = np.nonzero(asked)
-    motion = np.zeros((*asked.shape, scene.shape.shape[1], 3), np.float32)
+    motion, believed = np.zeros((*asked.shape, scene.shape.shape[1], 3), np.float32), np.ones(asked.shape, bool)
     guess = scenes.nominal(scene)
     centers = np.asarray(clutter.in_chunks(_centers, guess, poses))
     for begin in range(0, len(table), engine.batch):
@@ -80,8 +87,10 @@ def _motions(engine: Engine, scene: Scene, poses: Array, proposals: Proposal, lo
         pushes = jax.tree.map(lambda leaf, r=rows, p=push: leaf[r, p], proposals.pushes)
         rollout = primitives.push(engine, structs.take(guess, rows), poses[rows], pushes, longest=longest)
         after = np.asarray(rollout.poses)[:, -1]
-        motion[rows, push] = geometry.planar_motion(poses[rows], after, centers[rows])
-    return motion
+        good = Fault.usable(rollout.fault)
+        moved = np.asarray(geometry.planar_motion(poses[rows], after, centers[rows]))
+        motion[rows, push], believed[rows, push] = np.where(good[:, None, None], moved, 0.0), good
+    return motion, believed
 
 
 @jax.jit

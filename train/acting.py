@@ -154,6 +154,6 @@ def push_reward(now: Look, then: Look, *, method: str) -> np.ndarray:
 
 
 def with_future(reward: np.ndarray, then: Look, more: np.ndarray) -> np.ndarray:
-    """VPG's targets `[T]`: the reward, and the discounted value of the best action after it where there is `more`."""
+    """Targets `[T]` of Q-learning: reward, and discounted value of the best next action where there is `more`."""
     future = np.minimum(np.maximum(then.push_value, then.grasp_value), MOST)
     return reward + DISCOUNT * np.where(more & np.isfinite(future), future, 0.0)

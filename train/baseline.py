@@ -45,6 +45,7 @@ class BaselineConfig:
     """How to learn."""
 
     method: MethodName = "vpg"
+    preset: str = "compact"
     actions: int = 2500
     tables: int = 10
     updates: int = 10  # optimizer steps after each round of one action a table
@@ -59,6 +60,7 @@ class State:
     """Everything that a run is at a moment."""
 
     params: Any
+    rest: Any  # of the network: batch statistics
     moments: Any
     tables: tables.Tables
     then: Look | None = None  # at the tables after their last action, by the weights of then
@@ -88,7 +90,13 @@ class _Outcomes:
 
 
 def learn(
-    engine: Engine, scenes: SceneConfig, config: BaselineConfig, out: pathlib.Path, *, scorer: Scorer | None = None
+    engine: Engine,
+    scenes: SceneConfig,
+    config: BaselineConfig,
+    out: pathlib.Path,
+    *,
+    scorer: Scorer | None = None,
+    scored_by: str = "",
 ) -> dict[str, float]:
     """Learn in the folder `out`; a run that was interrupted goes on.
 
@@ -98,6 +106,7 @@ def learn(
       config: how.
       out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
       scorer: GN, whose grasps `dqn` takes.
+      scored_by: what tells this GN from another: a digest of its weights.
 
     Returns:
       Mean reward of all and of the last pushes and grasps.
@@ -109,9 +118,11 @@ def learn(
         raise UserError(
             f"baseline: --method {config.method} takes {'a' if config.method == 'dqn' else 'no'} --grasp-net"
         )
-    network = VpgConfig(parts=PARTS[config.method], answers="chance" if config.method == "rea" else "value")
+    answers = "chance" if config.method == "rea" else "value"
+    network = VpgConfig(config.preset, PARTS[config.method], answers)
     model: Any = checkpoint.build("vpg", network, seed=config.seed)
     identity = {**dataclasses.asdict(config), "scenes": str(scenes), "engine": type(engine).__name__}
+    identity |= {"grasp_net": scored_by} if scored_by else {}
     run = Run(out, identity)
     ended = run.ended()
     if ended:
@@ -121,21 +132,21 @@ def learn(
         optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
     )
     step = make_step(_Outcomes(network.answers), graph, optimizer)
-    weights = jax.device_get(params)
+    weights, statistics = jax.device_get((params, rest))
 
     def fresh() -> State:
         begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
-        return State(weights, jax.device_get(optimizer.init(weights)), begun)
+        return State(weights, statistics, jax.device_get(optimizer.init(weights)), begun)
 
     def act(state: State) -> str:
-        look = functools.partial(acting.look, graph, state.params, rest, scorer=scorer, distance=DISTANCE)
+        look = functools.partial(acting.look, graph, state.params, state.rest, scorer=scorer, distance=DISTANCE)
         _act(state, look, engine, scenes, config)
-        state.params, state.moments = _update(state, step, rest, config)
+        state.params, state.rest, state.moments = _update(state, step, config)
         return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT).items())
 
     total, log = -(-config.actions // config.tables), functools.partial(_log, out, config)
     state = run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
-    nnx.update(model, jax.tree.map(jnp.asarray, state.params))
+    nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
     result = _rewards(state.did, len(state.did)) | {f"{k}/recent": v for k, v in _rewards(state.did, RECENT).items()}
     extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
     run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
@@ -159,7 +170,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     effect = np.where(pushing, changed, success)
     reward = np.where(pushing, acting.push_reward(now, then, method=config.method), success.astype(float))
     target = reward
-    if config.method == "vpg":
+    if config.method != "rea":
         target = acting.with_future(reward, then, (scene.shape >= 0).any(1) & effect)
     for name, rows, centre, angle in (
         ("push", pushing & good, push.start, push.angle),
@@ -170,26 +181,25 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
             tried = GraspEpisode(
                 before.scene, before.poses, poses, aim, held, target.astype(np.float32), np.zeros(count, int)
             )
-            taught = windows(structs.take(tried, rows), pixels=WINDOWS["compact"] + 2 * PHASE)
+            taught = windows(structs.take(tried, rows), pixels=WINDOWS[config.preset] + 2 * PHASE)
             state.seen[name].append(taught)
     state.did += [("push" if pushing[i] else "grasp", float(reward[i])) for i in np.flatnonzero(good)]
     state.anew, state.then = state.tables.step(scene, poses, effect, good, engine, scenes), then
 
 
-def _update(state: State, step: Callable[..., Any], rest: Any, config: BaselineConfig) -> tuple[Any, Any]:
+def _update(state: State, step: Callable[..., Any], config: BaselineConfig) -> tuple[Any, Any, Any]:
     """Some optimizer steps on everything tried so far."""
     parts = PARTS[config.method]
     if not all(state.seen[name] for name in parts):
-        return state.params, state.moments
+        return state.params, state.rest, state.moments
     seen = {name: structs.concatenate(state.seen[name]) for name in parts}
     rng = np.random.default_rng([config.seed, state.round, 1])
     key = jax.random.fold_in(jax.random.key(config.seed + 1), state.round)
-    params, moments = jax.tree.map(jnp.array, (state.params, state.moments))
+    params, rest, moments = jax.tree.map(jnp.array, (state.params, state.rest, state.moments))
     for k in range(config.updates):
         batch = {n: structs.take(some, rng.integers(len(some.target), size=config.batch)) for n, some in seen.items()}
-        again = jax.tree.map(jnp.array, rest)
-        params, rest, moments, _ = step(params, again, moments, batch, jax.random.fold_in(key, k))
-    return jax.device_get((params, moments))
+        params, rest, moments, _ = step(params, rest, moments, batch, jax.random.fold_in(key, k))
+    return jax.device_get((params, rest, moments))
 
 
 def _rewards(did: list[tuple[str, float]], last: int) -> dict[str, float]:

@@ -194,6 +194,7 @@ def baseline(
     out: pathlib.Path,
     method: baselines.MethodName = "vpg",
     grasp_net: pathlib.Path | None = None,
+    preset: Preset = "compact",
     actions: int = 2500,
     objects: str = "10",
     tables: int = 10,
@@ -215,6 +216,7 @@ def baseline(
       out: run folder; the same command goes on where it stopped.
       method: vpg, rea or dqn.
       grasp_net: run of dipn-train grasp or grasp-online, or builtin, whose grasps dqn takes.
+      preset: architecture; paper is two DenseNet-121 trunks a primitive, for an accelerator.
       actions: pushes and grasps in all.
       objects: number of objects on a fresh table: 10, or 1:7.
       tables: acted on side by side.
@@ -229,10 +231,11 @@ def baseline(
     console.require_between(0, 1, weight_decay=weight_decay)
     console.require_seed(seed)
     console.require_out(out)
-    config = baselines.BaselineConfig(method, actions, tables, updates, batch, learning_rate, weight_decay, seed)
+    learning = (tables, updates, batch, learning_rate, weight_decay, seed)
+    config = baselines.BaselineConfig(method, preset, actions, *learning)
     gn: Any = checkpoint.load_network(grasp_net, network="grasp") if grasp_net else None
-    scorer = policy.plain_scorer(gn) if gn else None
-    result = baselines.learn(make_engine(engine), scenes.parse_objects(objects), config, out, scorer=scorer)
+    scored: dict[str, Any] = {"scorer": policy.grasp_scorer(gn), "scored_by": checkpoint.digest(gn)} if gn else {}
+    result = baselines.learn(make_engine(engine), scenes.parse_objects(objects), config, out, **scored)
     console.say(f"{out}: " + ", ".join(f"{name} {value:.3f}" for name, value in result.items()))
 
 

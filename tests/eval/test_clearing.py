@@ -14,7 +14,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
-from eval import clearing, clearing_cli, deciding, metrics, sweeping
+from eval import clearing, clearing_cli, deciding, instances, metrics, sweeping
 from eval.instances import Instance, Tables
 
 CONFIGS: dict[str, tuple[str, Any]] = {
@@ -22,6 +22,7 @@ CONFIGS: dict[str, tuple[str, Any]] = {
     "grasp": ("grasp", GraspConfig(width=8, coarse=8, blocks=1)),
     "value": ("vpg", VpgConfig(width=8, coarse=8)),
     "only": ("vpg", VpgConfig(parts=("grasp",), width=8, coarse=8)),
+    "chances": ("vpg", VpgConfig(parts=("grasp",), answers="chance", width=8, coarse=8)),
 }
 
 
@@ -44,7 +45,10 @@ def test_every_method_decides_on_every_table_by_itself(
     method: Any, engine: Any, settled: Any, runs: dict[str, pathlib.Path]
 ) -> None:
     plan = deciding.Plan(method, candidates=3, threshold=0.9, gamma=1.2)
-    decide = deciding.load(plan, _nets(runs), engine, slots=5)
+    nets = _nets(runs)
+    if method == "rea+dipn":
+        nets = dataclasses.replace(nets, value=runs["chances"])
+    decide = deciding.load(plan, nets, engine, slots=5)
     keys = jax.random.split(jax.random.key(0), 3)
     scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]
     none = np.tile(planner.NONE_MISSED, (3, 4, 1))
@@ -57,6 +61,10 @@ def test_every_method_decides_on_every_table_by_itself(
     assert (doubting.values[:, 0] < together.values[:, 0]).all() and (doubting.grasp_pixel != missed[:, -1]).any()
     if method == "gn":
         assert not together.is_push.any()
+        forgetful = deciding.load(dataclasses.replace(plan, remember=False), nets, engine, slots=5)
+        np.testing.assert_array_equal(forgetful(keys, scene, poses, missed).grasp_pixel, together.grasp_pixel)
+        rash = deciding.load(dataclasses.replace(plan, cautious=False), nets, engine, slots=5)
+        assert (rash(keys, scene, poses, none).values[:, 0] > together.values[:, 0]).all()
     if method == "physics+gn":
         assert np.abs(together.motion).max() > 0.01, "the engine was not asked, or moved nothing"
 
@@ -91,6 +99,8 @@ def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pa
     grasps_only = deciding.Nets(None, runs["grasp"], runs["only"])
     with pytest.raises(UserError, match="has not learnt to push"):
         deciding.load(deciding.Plan("dqn+gn"), grasps_only, engine, slots=5)
+    with pytest.raises(UserError, match="has learnt values, not chances"):
+        deciding.load(deciding.Plan("rea+dipn"), _nets(runs), engine, slots=5)
     with pytest.raises(UserError, match="holds a grasp network, want vpg"):
         deciding.load(deciding.Plan("vpg"), deciding.Nets(value=runs["grasp"]), engine, slots=5)
     with pytest.raises(UserError, match="--method search"):
@@ -107,6 +117,32 @@ def test_tables_are_a_case_file_or_random() -> None:
     assert Tables("random", objects="1:7").path() is None and Tables("random", objects="1:7").slots() == 7
     with pytest.raises(UserError, match="--instances 0"):
         Tables(instances=0)
+    with pytest.raises(UserError, match="--names: random tables have none"):
+        Tables("random", names=("a",))
+
+
+def test_a_repeat_of_a_case_is_the_same_however_many_others_there_are(engine: Any) -> None:
+    path = cases.hard_cases_path()
+    names, scene, poses = cases.load_cases(path, slots=6)
+    few, more = (instances.hard_instances(engine, path, names[1:3], slots=6, repeats=count, seed=0) for count in (2, 3))
+    assert [each.name for each in more] == [names[1]] * 3 + [names[2]] * 3
+    for here, there in zip(few, [more[0], more[1], more[3], more[4]], strict=True):
+        np.testing.assert_array_equal(here.scene.mass, there.scene.mass)
+        np.testing.assert_allclose(here.poses, there.poses, atol=1e-6)
+    np.testing.assert_array_equal(more[0].scene.mass, scene.mass[1])
+    there = scene.shape[1] >= 0
+    factor = more[1].scene.mass[there] / scene.mass[1][there]
+    assert (
+        (np.abs(factor - 1) <= 0.2).all() and (factor != 1).all() and (more[1].scene.mass != more[2].scene.mass).any()
+    )
+    moved = np.linalg.norm(more[1].poses[there, :2] - poses[1][there, :2], axis=-1)
+    assert moved.min() > 0 and moved.max() < 2 * instances.JITTER  # and what overlap has pushed apart
+
+
+def test_a_sweep_has_a_candidate_for_every_distance(tmp_path: pathlib.Path) -> None:
+    builtin = pathlib.Path("builtin")
+    with pytest.raises(UserError, match="--candidates 1: want at least one for each of the 2 distances"):
+        clearing_cli.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), candidates=1)
 
 
 def test_distances_are_parsed_and_nonsense_is_refused() -> None:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import cases, checkpoint, clutter, policy, scenes
+from dipn_jax import candidates, cases, checkpoint, clutter, policy, primitives, render, scenes, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.resume import Partial
-from dipn_jax.structs import Push
+from dipn_jax.structs import Push, Scene
 from eval import clearing, comparison, deciding, film, grasping, instances, metrics, prediction, report
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
@@ -194,6 +194,41 @@ def test_every_table_ends_by_the_rules(cleared: Any, tmp_path: pathlib.Path) -> 
         cut.write_bytes(content)
         with pytest.raises(UserError, match="missing, damaged or no film"):
             film.load(cut)
+
+
+def test_a_saved_episode_can_be_simulated_again(cleared: Any, engine: Any) -> None:
+    tables, out = cleared
+    for number in range(len(tables)):
+        reel = film.load(out / "episodes" / f"{number:03d}.npz")
+        scene, poses = Scene(reel.shape[0], reel.size, reel.color, reel.mass, reel.friction), reel.poses[0]
+        if reel.what[0] == "push":
+            push = Push(reel.push[0, :2], reel.push[0, 2], reel.push[0, 3])
+            after = primitives.push(engine, *structs.stack([(scene, poses)]), structs.stack([push])).poses[0, -1]
+        else:
+            grasp = candidates.grasp_at(reel.grasp[0], render.render(scene, poses).height)
+            after = clutter.grasp_away(engine, *structs.stack([(scene, poses)]), structs.stack([grasp]))[1][0]
+        np.testing.assert_allclose(after, reel.poses[1], atol=1e-5)
+
+
+def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib.Path) -> None:
+    _, out = cleared
+    one = comparison.Cleared(out)
+    entry = one.episodes[0]
+    last = film.load(out / entry["file"]).what[-1]
+    assert comparison._cause(one, entry | {"ended": "out of actions"}) == "out of actions"
+    lost = comparison._cause(one, entry | {"ended": "pushed out"})
+    assert lost == ("pushed out" if last == "push" else "thrown out") and set(comparison.CAUSES) >= {lost}
+    assert comparison._tables_name("hard", "10") == "hard" and comparison._tables_name("random", "30") == "random-30"
+    assert (
+        comparison._tables_name("my/hard.json", "10") == "own-hard" and comparison._tables_name("my/a.json", "") == "a"
+    )
+
+
+def test_learning_curves_show_whatever_lines_have(tmp_path: pathlib.Path) -> None:
+    lines = [{"step": 10, "reward/grasp": 0.5}, {"step": 20, "reward/push": 0.25}, {"step": 30, "reward/grasp": 0.75}]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    drawn = {line.get_label(): line.get_xydata().tolist() for line in report._curves([tmp_path]).axes[0].lines}
+    assert drawn == {"reward/grasp": [[10, 0.5], [30, 0.75]], "reward/push": [[20, 0.25]]}
 
 
 def test_the_course_of_clearing_is_what_was_left_after_each_action(cleared: Any) -> None:

@@ -77,12 +77,22 @@ def test_exploration_fades_and_reactive_grasps_never_push() -> None:
     assert not acting.choose(now, np.random.default_rng(0), 0, may_push=False)[0].any()
 
 
-@pytest.mark.parametrize("method", ["vpg", "rea"])
+def _flat_scores(images: jax.Array) -> jax.Array:
+    """A GN that likes objects more the higher they are."""
+    return jnp.tile(images[:, None, ..., 3], (1, 16, 1, 1))
+
+
+@pytest.mark.parametrize("method", ["vpg", "rea", "dqn"])
 def test_a_run_that_was_interrupted_goes_on_to_the_same_end(
     method: Any, engine: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = baseline.BaselineConfig(method, actions=8, tables=4, updates=2, batch=4)
-    whole = baseline.learn(engine, CONFIG, config, tmp_path / "a")
+    gn: dict[str, Any] = {"scorer": _flat_scores, "scored_by": "one"} if method == "dqn" else {}
+    futures: list[int] = []
+    with_future = acting.with_future
+    monkeypatch.setattr(acting, "with_future", lambda *args: futures.append(1) or with_future(*args))
+    whole = baseline.learn(engine, CONFIG, config, tmp_path / "a", **gn)
+    assert bool(futures) == (method != "rea"), "values count what comes next, chances do not"
     save = resume.Partial.save
 
     def stop(self: resume.Partial, state: Any) -> None:
@@ -91,18 +101,51 @@ def test_a_run_that_was_interrupted_goes_on_to_the_same_end(
 
     monkeypatch.setattr(resume.Partial, "save", stop)
     with pytest.raises(KeyboardInterrupt):
-        baseline.learn(engine, CONFIG, config, tmp_path / "b")
+        baseline.learn(engine, CONFIG, config, tmp_path / "b", **gn)
     monkeypatch.setattr(resume.Partial, "save", save)
-    assert baseline.learn(engine, CONFIG, config, tmp_path / "b") == whole
+    if method == "dqn":
+        with pytest.raises(UserError, match="grasp_net"):
+            baseline.learn(engine, CONFIG, config, tmp_path / "b", scorer=_flat_scores, scored_by="another")
+    assert baseline.learn(engine, CONFIG, config, tmp_path / "b", **gn) == whole
     there, here = (checkpoint.load_network(tmp_path / name, network="vpg") for name in "ab")
     assert checkpoint.digest(there) == checkpoint.digest(here)
     pushes, grasps = policy.load_values(tmp_path / "a")
-    assert (pushes is None) == (method == "rea") and grasps is not None
-    with pytest.raises(UserError, match="takes no --grasp-net"):
-        baseline.learn(engine, CONFIG, config, tmp_path / "c", scorer=grasps)
+    assert (pushes is None) == (method == "rea") and (grasps is None) == (method == "dqn")
+    with pytest.raises(UserError, match="takes a --grasp-net" if gn else "takes no --grasp-net"):
+        baseline.learn(engine, CONFIG, config, tmp_path / "c", **({} if gn else {"scorer": grasps}))
     with pytest.raises(UserError, match="seed"):
         other = baseline.BaselineConfig(method, actions=8, tables=4, updates=2, batch=4, seed=1)
-        baseline.learn(engine, CONFIG, other, tmp_path / "a")
+        baseline.learn(engine, CONFIG, other, tmp_path / "a", **gn)
+
+
+@pytest.mark.slow
+def test_the_published_form_looks_and_learns(engine: Any) -> None:
+    """Traced, not compiled."""
+    import functools
+
+    import optax
+    from flax import nnx
+
+    from dipn_jax.networks.vpg import VpgConfig
+    from train.grasp import PHASE, WINDOWS, Window
+    from train.loop import make_step
+
+    model = checkpoint.build("vpg", VpgConfig("paper", blocks=(1, 1, 1, 1)))
+    graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
+    played = tables.begin(engine, CONFIG, count=2, seed=1)
+    look = functools.partial(acting.look, graph, scorer=None, distance=0.1)
+    keys = jax.random.split(jax.random.key(0), 2)
+    seen = jax.eval_shape(look, params, rest, keys, played.scene, played.poses, np.ones(2, bool))
+    assert seen.push_value.shape == seen.grasp_value.shape == (2,)
+    wide = WINDOWS["paper"] + 2 * PHASE
+    some = Window(
+        np.zeros((2, wide, wide), np.float16), np.zeros((2, wide, wide), np.int8), np.zeros((2, 3, 3)), np.zeros(2)
+    )
+    optimizer = optax.adam(1e-3)
+    step = make_step(baseline._Outcomes("value"), graph, optimizer)
+    moments = jax.eval_shape(optimizer.init, params)
+    after = jax.eval_shape(step, params, rest, moments, {"push": some, "grasp": some}, jax.random.key(0))
+    assert after[3].shape == () and jax.tree.leaves(after[1]), "no batch statistics"
 
 
 def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
