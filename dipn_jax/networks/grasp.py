@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import geometry, render
+from dipn_jax import candidates, geometry, render
 from dipn_jax.errors import UserError
 from dipn_jax.networks import resnet
 from dipn_jax.workspace import GRIPPER, ROTATIONS, WORKSPACE, grasp_angles
@@ -232,13 +232,8 @@ def geometric_labels(height: jax.Array) -> jax.Array:
     Returns:
       `[H, W]` float, 1 for positive.
     """
-    tip = _tip(height)
+    tip = candidates.grasp_height(height)
     return ((height > tip + MIN_DEPTH) & (_under_fingers(height) < tip)).astype(jnp.float32)
-
-
-def _tip(height: jax.Array) -> jax.Array:
-    """Metres above the table to which the fingertips go for a grasp centred on each pixel of `height`."""
-    return jnp.maximum(height - 0.04, 0.02)
 
 
 def _under_fingers(height: jax.Array) -> jax.Array:
@@ -274,7 +269,9 @@ def blocked_image(height: jax.Array) -> jax.Array:
     beyond = jnp.where(outside[:, None] | outside, height, 0.0)
     hidden = jax.lax.reduce_window(beyond, 0.0, jax.lax.max, (2 * HIDDEN + 1,) * 2, (1, 1), "SAME") > EMPTY
     height = jnp.where((outside[:, None] | outside) & hidden, WALL, height)
-    return _of_every_grasp(height, lambda turned: (_under_fingers(turned) > _tip(turned) + BLOCKED).astype(jnp.float32))
+    return _of_every_grasp(
+        height, lambda turned: (_under_fingers(turned) > candidates.grasp_height(turned) + BLOCKED).astype(jnp.float32)
+    )
 
 
 def _of_every_grasp(height: jax.Array, judge: Callable[[jax.Array], jax.Array]) -> jax.Array:
