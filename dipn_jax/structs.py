@@ -173,7 +173,7 @@ class Decision(Pytree):
     push: Push
     grasp_pixel: Array  # [3] int32: rotation, row, col of the best grasp
     grasp_score: Array  # [] score of that grasp in [0, 1]
-    value_now: Array  # [] mean score of all grasps now; if no push was allowed, of the scores that the best grasp was chosen by
+    value_now: Array  # [] mean score of all grasps now (of the cautious ones if no push was allowed)
     value_push: Array  # [] gamma times the mean score after the best push; -inf if none is feasible
     predicted: Array  # [H, W, 4] predicted RGB and height after the best push
     best: Array  # [] int32 index of the best push among the candidates
