@@ -118,7 +118,7 @@ CLEAR := results/clear
 ON := results/clear/table
 BASELINE := $(BIN)/dipn-train baseline --method
 TABLES := hard:--cases_hard_--instances_30 30:--cases_random_--objects_30_--instances_30 10:--cases_random_--objects_10_--instances_30
-FEWER := hard:--cases_hard_--instances_10 30:--cases_random_--objects_30_--instances_10
+FEWER := hard:--cases_hard_--instances_30 30:--cases_random_--objects_30_--instances_10
 clear-figures: setup
 	$(BIN)/dipn-train grasp-online --init $(GRASP)/pretrained --grasps 500 --out $(CLEAR)/gn
 	$(BIN)/dipn-train push --data $(PUSH)/data --limit 1500 --steps 3000 --out $(CLEAR)/dipn
@@ -145,6 +145,8 @@ clear-figures: setup
 	  $$large --method gn --grasp-net builtin --out $(ON)/gn-only-$$on || exit; \
 	  $$large --method physics+gn --grasp-net builtin --out $(ON)/physics-gn-$$on || exit; \
 	done
+	$(BIN)/dipn-eval clear --cases hard --instances 30 --label paper --method gn --grasp-net $(CLEAR)/gn --out $(ON)/gn-paper-hard
+	$(BIN)/dipn-eval clear --cases hard --instances 30 --label unguarded --no-cautious --no-remember --push-net builtin --grasp-net builtin --out $(ON)/unguarded-hard
 	$(BIN)/dipn-eval report --clear $(ON)/* --out $(CLEAR)
 	$(BIN)/dipn-eval sweep --push-net builtin --grasp-net builtin --distances 0.03:0.12:0.01 --instances 3 --out $(CLEAR)/sweep
 	$(BIN)/python docs/clearing.py $(ON) $(CLEAR)/sweep
