@@ -197,6 +197,7 @@ def _engine_parts(cells: _Cells) -> list[str]:
     rows = [
         [name, cells.number(f"agreement/{name}/scenes", ".0f")]
         + [cells.pair(f"agreement/{name}/{at}", unit) for at in ("1cm", "5cm", "10cm") for unit in ("mm", "deg")]
+        + [cells.number(f"agreement/{name}/{key}", ".0f") for key in ("grasps", "grasps_that_held")]
         + [cells.share(f"agreement/{name}/grasp"), cells.share(f"agreement/{name}/unsettled")]
         for name in world.ENGINES
         if f"agreement/{name}/grasp" in cells.metrics
@@ -204,5 +205,5 @@ def _engine_parts(cells: _Cells) -> list[str]:
     columns = [f"{c} cm, {u}" for c in (1, 5, 10) for u in ("mm", "deg")]
     return [
         "## Engines against `native` at 2 ms, objects that it moves: p50 / p90",
-        _table(["engine", "scenes", *columns, "grasps equal", "unsettled"], rows),
+        _table(["engine", "scenes", *columns, "grasps", "of them held", "equal", "unsettled"], rows),
     ]

@@ -19,7 +19,8 @@ COUNTS = (1, 3, 7, 10, 20, 30)
 """Numbers of objects that drops are counted for."""
 MOVED = 0.001
 """Metres: what the reference moves by more during a push counts in the engines' agreement."""
-"""Radians by which an object's own axes tilt when it tips over or rolls."""
+GRASPS = 4
+"""Grasps of each scene in the engines' agreement: one alone would make a share of few."""
 ENGINES: dict[str, tuple[EngineName, dict[str, float]]] = {
     "native_awake": ("native", {"sleep": 0.0}),
     "native_1ms": ("native", {"timestep": 0.001}),
@@ -34,11 +35,11 @@ Metrics = dict[str, float]
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """Settled scenes, and a push and a grasp for every one; leaves `[B, ...]`."""
+    """Settled scenes, and a push and some grasps for every one."""
 
-    items: SettledScene
-    pushes: Push
-    grasps: Grasp
+    items: SettledScene  # [B]
+    pushes: Push  # [B]
+    grasps: Grasp  # [B, A]
 
     def first(self, count: int) -> Trial:
         """The first `count` of them."""
@@ -90,15 +91,15 @@ def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
 
 
 def trial(key: jax.Array, engine: Engine, count: int) -> Trial:
-    """`count` scenes of 1 to 7 objects, with a random feasible push and a random grasp of the foreground."""
+    """`count` scenes of 1 to 7 objects, with a random feasible push and GRASPS random grasps of the foreground."""
     drop, aim = jax.random.split(key)
     items = clutter.settled_exactly(drop, engine, scenes.SceneConfig(), 2 * count)
     keys = jax.random.split(aim, len(items.fault))
     pushes, feasible = episodes.aim_pushes(keys, items.scene, items.poses, actions=1)
-    grasps = episodes.aim_grasps(keys, items.scene, items.poses, actions=1)
+    grasps = episodes.aim_grasps(keys, items.scene, items.poses, actions=GRASPS)
     index = np.flatnonzero(np.asarray(feasible)[:, 0])[:count]
-    pushes, grasps = (jax.tree.map(lambda leaf: np.asarray(leaf)[index, 0], x) for x in (pushes, grasps))
-    return Trial(structs.take(items, index), pushes, grasps)
+    pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[index, 0], pushes)
+    return Trial(structs.take(items, index), pushes, structs.take(grasps, index))
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -157,14 +158,15 @@ def _apart(name: str, found: np.ndarray, wanted: np.ndarray, poses: np.ndarray) 
 
 
 def agreement(name: str, engine: Engine, made: Trial, poses: np.ndarray, held: np.ndarray) -> Metrics:
-    """`agreement/{engine}/...`: against the reference's `poses [B, 12, N, 7]` and `held [B, N]`."""
+    """`agreement/{engine}/...`: against the reference's `poses [B, 12, N, 7]` and `held [B, A, N]`."""
     rollout = primitives.push(engine, made.items.scene, made.items.poses, made.pushes)
     found: Metrics = {}
     for centimetres in (1, 5, 10):
         at = np.asarray(rollout.poses)[:, centimetres]
         found.update(_apart(f"agreement/{name}/{centimetres}cm", at, poses[:, centimetres], poses))
-    _, outcome = primitives.grasp(engine, made.items.scene, made.items.poses, made.grasps)
-    found[f"agreement/{name}/grasp"] = float((np.asarray(outcome.held) == held).all(-1).mean())
+    found[f"agreement/{name}/grasp"] = float((held_by(engine, made) == held).all(-1).mean())
+    found[f"agreement/{name}/grasps"] = held.shape[0] * held.shape[1]
+    found[f"agreement/{name}/grasps_that_held"] = int(held.any(-1).sum())
     fault = np.asarray(rollout.fault)
     found[f"agreement/{name}/unsettled"] = Fault.count(fault)["unsettled"] / len(fault)
     found[f"agreement/{name}/scenes"] = len(fault)
@@ -189,6 +191,9 @@ def camera(key: jax.Array, engine: Engine, count: int) -> Metrics:
 
 
 def held_by(engine: Engine, made: Trial) -> np.ndarray:
-    """What the reference holds after each grasp `[B, N]`."""
-    _, outcome = primitives.grasp(engine, made.items.scene, made.items.poses, made.grasps)
-    return np.asarray(outcome.held)
+    """What an engine holds after each grasp `[B, A, N]`, every grasp from the settled scene."""
+    held = []
+    for action in range(np.shape(made.grasps.angle)[1]):
+        grasps = jax.tree.map(lambda leaf, a=action: np.asarray(leaf)[:, a], made.grasps)
+        held.append(primitives.grasp(engine, made.items.scene, made.items.poses, grasps)[1].held)
+    return np.stack([np.asarray(each) for each in held], 1)

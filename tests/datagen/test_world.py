@@ -19,18 +19,22 @@ DOCS = pathlib.Path(__file__).parents[2] / "docs"
 def trial(settled: Any) -> world.Trial:
     keys = jax.random.split(jax.random.key(0), len(settled.fault))
     pushes, _ = episodes.aim_pushes(keys, settled.scene, settled.poses, actions=1)
-    grasps = episodes.aim_grasps(keys, settled.scene, settled.poses, actions=1)
-    pushes, grasps = (jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], x) for x in (pushes, grasps))
-    return world.Trial(settled, pushes, grasps)
+    pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], pushes)
+    return world.Trial(settled, pushes, episodes.aim_grasps(keys, settled.scene, settled.poses, actions=2))
 
 
 def test_an_engine_agrees_with_itself_and_a_turn_is_seen(engine: Any, trial: world.Trial) -> None:
     counted, poses = world.pushes(engine, trial)
     assert counted["push/moved_objects"] > 2 and 0 <= counted["push/tipped_of_moved"] < 1
-    found = world.agreement("native", engine, trial, poses, world.held_by(engine, trial))
+    held = world.held_by(engine, trial)
+    assert held.shape == (6, 2, 5) and held.any()
+    found = world.agreement("native", engine, trial, poses, held)
     assert found["agreement/native/5cm/p90_mm"] == 0 and found["agreement/native/grasp"] == 1
+    assert found["agreement/native/grasps"] == 12 and found["agreement/native/grasps_that_held"] == held.any(-1).sum()
+    held[0, 1] ^= True
+    assert world.agreement("native", engine, trial, poses, held)["agreement/native/grasp"] == 11 / 12
     quarter = np.asarray(geometry.transform_poses(poses.reshape(-1, 7), np.pi / 2, np.zeros(2))).reshape(poses.shape)
-    turned = world.agreement("native", engine, trial, quarter, np.zeros((6, 5), bool))
+    turned = world.agreement("native", engine, trial, quarter, np.zeros((6, 2, 5), bool))
     assert abs(turned["agreement/native/10cm/p50_deg"] - 90) < 0.2
 
 
