@@ -29,10 +29,14 @@ from dipn_jax.structs import Pytree
 
 DECREMENT = 1e-6
 """Newton ends when the cost it can still gain is below this share of the cost (float32 resolves 1e-7)."""
-FLAT = 1e-2
-"""The line search ends when the slope is below this share of the slope at its beginning."""
-STRETCH = 4.0
-"""Most that a step of the line search grows while the minimum is further on."""
+FLAT = 0.1
+"""The line search ends when the slope is below this share of the slope at its beginning ..."""
+NARROW = 1e-2
+"""... or when what is left of its bracket is below this share of the step: rounding hides so small a slope."""
+TRIES = np.float32(4.0) ** np.arange(-6, 2, dtype=np.float32)
+"""Multiples of a Newton step that are tried first: tried at once, many cost an accelerator no more than one."""
+STRETCH = 4.0 ** len(TRIES)
+"""Most that a step grows from one round of tries to the next while the minimum is further on."""
 _TINY = 1e-12
 
 
@@ -147,27 +151,40 @@ def _slopes(p: _Problem, a: jax.Array, step: jax.Array) -> Callable[[jax.Array],
     return slopes
 
 
-def _line_search(p: _Problem, a: jax.Array, step: jax.Array, limit: int) -> jax.Array:
-    """The multiple of `step` with the least cost: Newton on the slope, kept in a bracket."""
-    slopes = _slopes(p, a, step)
-    begin = slopes(jnp.zeros(()))[0]
+def _line_search(
+    p: _Problem, a: jax.Array, step: jax.Array, begin: jax.Array, limit: int, idle: jax.Array
+) -> jax.Array:
+    """The multiple of `step` with the least cost: many are tried at once, then Newton and many more in a bracket.
+
+    The slope is `begin` where `step` does. In a batch all scenes wait for the one that tries most often; one that is
+    `idle`, its result of no use, is not waited for.
+    """
+    slopes = jax.vmap(_slopes(p, a, step))
+    parts = jnp.arange(1, len(TRIES)) / len(TRIES)
 
     def going(state: tuple[jax.Array, ...]) -> jax.Array:
         return ~state[-1] & (state[-2] < limit)
 
     def body(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        low, high, t, count, _ = state
-        first, second = slopes(t)
-        low, high = jnp.where(first < 0, t, low), jnp.where(first < 0, high, t)
-        found = jnp.abs(first) <= FLAT * jnp.abs(begin)
-        guess = t - first / second
-        middle = jnp.where(jnp.isfinite(high), (low + high) / 2, STRETCH * low)
-        inside = (guess > low) & (guess < jnp.minimum(high, STRETCH * jnp.maximum(low, t)))
-        return low, high, jnp.where(found, t, jnp.where(inside, guess, middle)), count + 1, found
+        low, high, tries, _, count, _ = state
+        first, second = slopes(tries)  # it rises from try to try: the cost is convex
+        low = jnp.maximum(low, jnp.where(first < 0, tries, 0.0).max())
+        high = jnp.minimum(high, jnp.where(first < 0, jnp.inf, tries).min())
+        steep = jnp.where(jnp.isfinite(first), jnp.abs(first), jnp.inf)
+        best = steep.argmin()
+        found = (steep[best] <= FLAT * jnp.abs(begin)) | (high - low <= NARROW * high)
+        guess = tries[best] - first[best] / second[best]
+        end = jnp.where(jnp.isfinite(high), high, STRETCH * low)
+        start = jnp.where(low > 0, low, TRIES[0] * high)
+        inside = (guess > low) & (guess < end)
+        more = start * (end / start) ** parts
+        fresh = jnp.append(more, jnp.where(inside, guess, jnp.sqrt(start * end)))
+        return low, high, fresh, tries[best], count + 1, found
 
     zero = jnp.zeros_like(begin)
-    state: tuple[jax.Array, ...] = (zero, zero + jnp.inf, zero + 1, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
-    low, _, t, _, found = jax.lax.while_loop(going, body, state)
+    tries = jnp.asarray(TRIES)
+    state: tuple[jax.Array, ...] = (zero, zero + jnp.inf, tries, zero, jnp.zeros((), jnp.int32), idle)
+    low, _, _, t, _, found = jax.lax.while_loop(going, body, state)
     return jnp.where(found, t, low)  # the cost falls all the way to `low`
 
 
@@ -178,11 +195,11 @@ def _minimize(p: _Problem, start: jax.Array, iterations: int, line: int) -> jax.
         return ~state[-1] & (state[-2] < iterations)
 
     def body(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        a, count, _ = state
+        a, count, done = state
         cost, gradient, step = _newton(p, a)
-        gain = -(gradient @ step) / 2
-        a = a + jnp.where(gain > 0, _line_search(p, a, step, line), 0.0) * step
-        return a, count + 1, ~(gain > DECREMENT * cost)
+        slope = gradient @ step
+        a = a + jnp.where(slope < 0, _line_search(p, a, step, slope, line, done), 0.0) * step
+        return a, count + 1, ~(-slope / 2 > DECREMENT * cost)
 
     state: tuple[jax.Array, ...] = (start, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
     return jax.lax.while_loop(going, body, state)[0]

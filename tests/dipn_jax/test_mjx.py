@@ -252,7 +252,7 @@ def _depths(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def test_contact_depths_agree_with_mujoco_c() -> None:
     scene, poses = _random_pairs(100)
-    with jax.numpy_rank_promotion("allow"):  # as in the engine
+    with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):  # as in the engine
         found, table = (np.asarray(x) for x in _depths(scene, poses))
     touching = 0
     for b in range(len(poses)):
