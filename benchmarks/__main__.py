@@ -68,6 +68,9 @@ BENCHMARKS = {
         "share of scenes on which the fast path decides as the plain one", ">= 0.99", "deciding:fast_path"
     ),
     "decide.lockstep": Benchmark("episodes a minute in lockstep over one by one", "none", "deciding:lockstep"),
+    "engines.scene_seconds": Benchmark(
+        "seconds of heaps of seven objects simulated a second, by each engine", "none", "rates:scene_seconds"
+    ),
     "rates.native": Benchmark("episodes a second of MuJoCo C, 1 to 30 objects", "none", "rates:native"),
     "rates.mjx": Benchmark("episodes a second of MJX, 1 to 30 objects", "none", "rates:mjx"),
     "rates.warp": Benchmark("episodes a second of MuJoCo Warp, 1 to 30 objects", "none", "rates:warp"),

@@ -31,7 +31,7 @@ def tables(figures: Figures) -> str:
     speeds = [_row(["episodes a second", *map(str, counts)]), _row(["---"] * (len(counts) + 1))]
     for kind, row in rates.items():
         speeds.append(_row([kind, *(f"{row[count]:.3g}" if count in row else "" for count in counts)]))
-    return "\n".join(ratios) + "\n\n" + "\n".join(speeds) + "\n"
+    return "\n\n".join("\n".join(table) for table in (ratios, speeds) if len(table) > 2) + "\n"
 
 
 def merged(paths: Sequence[pathlib.Path]) -> Figures:

@@ -1,24 +1,34 @@
-"""Episodes a second, absolute: for the documentation of one machine, not for comparing two."""
+"""What a second brings, absolute: for the documentation of one machine, not for comparing two."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
+import statistics
 from collections.abc import Iterator
 from unittest import mock
 
 import jax
+import numpy as np
 
 from benchmarks.datagen_mjx import engine as mjx_engine
+from benchmarks.datagen_mjx import heaps
 from benchmarks.datagen_native import ACTIONS
 from benchmarks.harness import Setting, Skipped, make_data, seconds
 from datagen import generate
-from dipn_jax import scenes
-from dipn_jax.physics import EngineName, make_engine
+from dipn_jax import primitives, scenes
+from dipn_jax.physics import Engine, EngineName, make_engine
+from dipn_jax.physics.mjx import MjxEngine
+from dipn_jax.physics.warp import WarpEngine
 
 COUNTS = (1, 3, 7, 10, 20, 30)
 FEW_ON_CPU = 4
 """Episodes that XLA and Warp make of each kind on a CPU at small scale: their rate is below one a second."""
+BATCHES = (512, 1024, 2048, 4096)
+"""Heaps at once on an accelerator, for `scene_seconds`."""
+SPAN = 0.2
+"""Seconds that they are simulated."""
 
 
 def _engine_kept(engine: EngineName) -> contextlib.AbstractContextManager[object]:
@@ -48,6 +58,28 @@ def _rates(engine: EngineName, setting: Setting, episodes: int) -> Iterator[tupl
         for objects in COUNTS:
             value = rate(engine, kind, objects, max(episodes * 7 // max(objects, 7), 4), setting.seed)
             yield f"rates.{engine}/{kind}/{objects}", value
+
+
+def scene_seconds(setting: Setting) -> Iterator[tuple[str, float]]:
+    """`engines.scene_seconds/ENGINE/BATCH`: seconds of heaps of seven objects simulated a second, by each engine."""
+    names: tuple[EngineName, ...] = ("native", "mjx", "warp")
+    for name in names[: 3 if importlib.util.find_spec("warp") else 2]:
+        for batch in (64,) if jax.default_backend() == "cpu" else BATCHES:
+            scene, poses = heaps(setting.seed, batch)
+            still, end = primitives.parked_trajectory(batch, SPAN), np.array([SPAN])
+            work = functools.partial(_sized(name, batch).simulate, scene, poses, still, end)
+            work()  # compiles
+            taken = statistics.median(seconds(work) for _ in range(setting.pick(1, 5)))
+            yield f"engines.scene_seconds/{name}/{batch}", batch * SPAN / taken
+
+
+def _sized(name: EngineName, batch: int) -> Engine:
+    """An engine that takes a whole batch at once, where that is for it to choose."""
+    if name == "mjx" and jax.default_backend() != "cpu":
+        return MjxEngine(chunk=batch)
+    if name == "warp":
+        return WarpEngine(chunk=batch)
+    return make_engine(name)
 
 
 def native(setting: Setting) -> Iterator[tuple[str, float]]:

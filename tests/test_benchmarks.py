@@ -28,8 +28,9 @@ def test_every_benchmark_can_be_loaded() -> None:
         assert callable(benchmark.load())
 
 
-def test_the_page_in_docs_shows_the_figures_in_docs() -> None:
-    figures = json.loads((DOCS / "benchmarks.json").read_text())["figures"]
+@pytest.mark.parametrize("name", ["benchmarks", "benchmarks-h200"])
+def test_the_page_in_docs_shows_the_figures_in_docs(name: str) -> None:
+    figures = json.loads((DOCS / f"{name}.json").read_text())["figures"]
     text = (DOCS / "benchmarks.md").read_text()
     for table in page.tables(figures).strip().split("\n\n"):
         assert table in text

@@ -27,6 +27,9 @@ FENCE = 0.17
 FENCE_RATE = 30.0
 """rad/s of the fence's critically damped spring (per mass): 11 mm beyond it, the push is an object's weight."""
 
+ENOUGH_CORES = 6
+"""Cores with which `native` is as fast as `mjx` on a large GPU (docs/benchmarks.md: an H200 does the work of 5.2)."""
+
 
 def fence_force(mass: Array, position: Array, velocity: Array, *, xp: ModuleType = jnp) -> Array:
     """What a fence does to objects: it has no surface, so any number of them costs no contact.
@@ -108,9 +111,9 @@ class Stopped(Exception):
 
 
 def resolve(name: EngineName) -> EngineName:
-    """`auto` is `native` on a CPU and `mjx` on an accelerator."""
+    """`auto` is `native`, or `mjx` on an accelerator whose host has few cores (ENOUGH_CORES)."""
     if name == "auto":
-        return "native" if jax.default_backend() == "cpu" else "mjx"
+        return "native" if jax.default_backend() == "cpu" or cores() >= ENOUGH_CORES else "mjx"
     return name
 
 

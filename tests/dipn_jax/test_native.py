@@ -247,3 +247,12 @@ def test_a_stopped_engine_stops(resting: Any) -> None:
 def test_unknown_engine_is_refused() -> None:
     with pytest.raises(UserError, match="engine 'bullet'"):
         physics.make_engine("bullet")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("device", "cores", "engine"), [("cpu", 2, "native"), ("gpu", 2, "mjx"), ("gpu", 16, "native")]
+)
+def test_auto_is_what_is_faster_there(monkeypatch: pytest.MonkeyPatch, device: str, cores: int, engine: str) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
+    monkeypatch.setattr(physics, "cores", lambda: cores)
+    assert physics.resolve("auto") == engine and physics.resolve("warp") == "warp"
