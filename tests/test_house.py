@@ -16,8 +16,8 @@ ROOT = pathlib.Path(__file__).parent.parent
 STAGES = ("datagen", "train", "eval")
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "structs", "workspace", "geometry", "shapes", "packing", "scenes", "cases", "model", "physics",
-    "primitives", "render", "segment", "candidates", "imagine", "losses", "networks", "planner", "files", "codec",
+    "errors", "files", "structs", "workspace", "geometry", "shapes", "packing", "scenes", "cases", "model", "physics",
+    "primitives", "render", "segment", "candidates", "imagine", "losses", "networks", "planner", "codec",
     "records", "checkpoint", "clutter", "policy", "resume", "console",
 ]  # fmt: skip
 

@@ -24,7 +24,7 @@ from mujoco.mjx._src.types import GeomType
 from dipn_jax import model, physics, shapes
 from dipn_jax.errors import UserError
 from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
-from dipn_jax.physics import cone, faults, prisms, recording
+from dipn_jax.physics import cone, faults, kept, prisms, recording
 from dipn_jax.physics.recording import Record, State
 from dipn_jax.scenes import parked
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
@@ -70,7 +70,7 @@ class MjxEngine:
             raise UserError(f"mjx: chunk {chunk}; want a power of two")
         on_cpu = self.devices[0].platform == "cpu"
         self.chunk, self.batch = chunk or (16 if on_cpu else 1024), 64 if on_cpu else 1024
-        self.programs: dict[int, Callable[..., Rollout]] = {}  # by number of slots
+        self.programs: dict[tuple[int, int], Callable[..., Rollout]] = {}  # by number of scenes and of slots
         self._stopped, self._lock = threading.Event(), threading.Lock()
 
     def simulate(
@@ -98,26 +98,50 @@ class MjxEngine:
                 part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)
                 if self._stopped.is_set():
                     raise physics.Stopped
-                room = _room(size, len(padded), slots)
-                fresh = self._program(slots)(*part, room, padded, np.bool_(settle), np.float32(fence))
+                whole = *part, _room(size, len(padded), slots), padded, np.bool_(settle), np.float32(fence)
+                fresh = self._program(size, slots, whole)(*whole)
                 done = [*done[:-1], *jax.device_get(done[-1:]), fresh]  # fetched while the next one runs
         out = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(x) for x in leaves])[:batch], *done)
         return Rollout(out.poses[:, : len(ticks)], out.gripper[:, : len(ticks)], out.fault)
 
-    def _program(self, slots: int) -> Callable[..., Rollout]:
-        """The compiled function for scenes of `slots` objects: each device runs its share of a batch by itself."""
-        if slots not in self.programs:
-            mesh = jax.sharding.Mesh(np.array(self.devices), ("batch",))
-            split, whole = jax.sharding.PartitionSpec("batch"), jax.sharding.PartitionSpec()
-            run = jax.shard_map(
-                _Program(self.config, slots, self.substeps).run,
-                mesh=mesh,
-                in_specs=(split, split, split, split, whole, whole, whole),
-                out_specs=split,
-                check_vma=False,  # MJX starts its loops from constants, which that check refuses
-            )
-            self.programs[slots] = jax.jit(run, donate_argnums=3)
-        return self.programs[slots]
+    def _program(self, size: int, slots: int, arguments: tuple[Any, ...]) -> Callable[..., Rollout]:
+        """The compiled function for `size` scenes of `slots` objects: each device runs its share by itself."""
+        if (size, slots) not in self.programs:
+            made = _Program(self.config, slots, self.substeps)
+            shared = len(self.devices) > 1
+            self.programs[size, slots] = self._shared(made) if shared else self._kept(made, arguments)
+        return self.programs[size, slots]
+
+    def _shared(self, made: _Program) -> Callable[..., Rollout]:
+        """On all devices."""
+        mesh = jax.sharding.Mesh(np.array(self.devices), ("batch",))
+        split, whole = jax.sharding.PartitionSpec("batch"), jax.sharding.PartitionSpec()
+        run = jax.shard_map(
+            made.run,
+            mesh=mesh,
+            in_specs=(split, split, split, split, whole, whole, whole),
+            out_specs=split,
+            check_vma=False,  # MJX starts its loops from constants, which that check refuses
+        )
+        return jax.jit(run, donate_argnums=3)
+
+    def _kept(self, made: _Program, arguments: tuple[Any, ...]) -> Callable[..., Rollout]:
+        """On the only device, traced once for all processes."""
+        tree = jax.tree.structure(arguments)
+        first = len(jax.tree.leaves(arguments[:3]))  # of the record's memory
+
+        def flat(*leaves: jax.Array) -> tuple[Array, ...]:
+            out = made.run(*jax.tree.unflatten(tree, leaves))
+            return out.poses, out.gripper, out.fault
+
+        donate = range(first, first + len(arguments[3]))
+        call = kept.program(flat, jax.tree.leaves(arguments), what=f"mjx {self.config} highest", donate=donate)
+
+        def run(*args: Any) -> Rollout:
+            with jax.default_device(self.devices[0]):
+                return Rollout(*call(*jax.tree.leaves(args)))
+
+        return run
 
     def stop(self) -> None:
         """See `physics.Engine.stop`: at the end of the chunk at hand."""

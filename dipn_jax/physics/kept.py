@@ -1,0 +1,58 @@
+"""Traced programs on disk: XLA's own cache saves compiling, and what is left of a first call is tracing, in Python."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import pathlib
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from jax import export
+
+from dipn_jax import files
+from dipn_jax.structs import Array
+
+_SOURCES = pathlib.Path(__file__).parent.parent
+
+
+@functools.cache
+def _versions() -> str:
+    """What every trace depends on: our sources and the packages."""
+    digest = hashlib.sha256(str(files.package_versions()).encode())
+    for path in sorted(_SOURCES.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def program(
+    function: Callable[..., tuple[Array, ...]], arguments: Sequence[np.ndarray], *, what: str, donate: Sequence[int]
+) -> Callable[..., tuple[Array, ...]]:
+    """`jax.jit(function)`, traced by an earlier process if one was.
+
+    Args:
+      function: of arrays, for one device.
+      arguments: what it will be called with; only shapes and types matter.
+      what: everything else that its trace depends on, such as a default precision of the moment.
+      donate: arguments whose memory the result takes over.
+
+    Returns:
+      A function of as many arrays. Traces lie in `traced` in the folder of JAX's compilation cache; without such a
+      folder nothing is kept. A file that cannot be read is written anew.
+    """
+    shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.asarray(leaf).dtype) for leaf in arguments]
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if not cache:
+        return jax.jit(function, donate_argnums=tuple(donate))
+    about = [_versions(), jax.default_backend(), str(jax.config.read("jax_enable_x64")), what, str(shapes)]
+    key = hashlib.sha256("\n".join(about).encode()).hexdigest()
+    path = pathlib.Path(cache) / "traced" / key
+    try:
+        traced = export.deserialize(bytearray(path.read_bytes()))
+        # JAX finds LAPACK when it lowers something that calls it; a program lowered elsewhere would call nothing
+        jax.block_until_ready(jax.numpy.linalg.cholesky(jax.numpy.eye(2)))
+    except Exception:  # not there or damaged: what a damaged one raises is not documented
+        traced = export.export(jax.jit(function))(*shapes)
+        files.write_atomically(path, bytes(traced.serialize()))
+    return jax.jit(traced.call, donate_argnums=tuple(donate))
