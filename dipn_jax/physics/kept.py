@@ -32,7 +32,7 @@ def program(
     """`jax.jit(function)`, traced by an earlier process if one was.
 
     Args:
-      function: of arrays, for one device.
+      function: of arrays, for one device, of the kind that JAX takes unasked.
       arguments: what it will be called with; only shapes and types matter.
       what: everything else that its trace depends on, such as a default precision of the moment.
       donate: arguments whose memory the result takes over.

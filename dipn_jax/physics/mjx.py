@@ -108,8 +108,8 @@ class MjxEngine:
         """The compiled function for `size` scenes of `slots` objects: each device runs its share by itself."""
         if (size, slots) not in self.programs:
             made = _Program(self.config, slots, self.substeps)
-            shared = len(self.devices) > 1
-            self.programs[size, slots] = self._shared(made) if shared else self._kept(made, arguments)
+            alone = len(self.devices) == 1 and self.devices[0].platform == jax.default_backend()
+            self.programs[size, slots] = self._kept(made, arguments) if alone else self._shared(made)
         return self.programs[size, slots]
 
     def _shared(self, made: _Program) -> Callable[..., Rollout]:
