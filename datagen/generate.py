@@ -195,4 +195,7 @@ def _claim(job: Job, out: pathlib.Path) -> None:
 
 def _begun_with(out: pathlib.Path) -> int:
     path = out / "config.json"
-    return int(files.read_json(path).get("episodes", 0)) if path.exists() else 0
+    episodes = files.read_json(path).get("episodes", 0) if path.exists() else 0
+    if not isinstance(episodes, int):
+        raise UserError(f"{path}: episodes {episodes}, want a whole number; give another --out")
+    return episodes

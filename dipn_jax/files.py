@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import os
 import pathlib
+import secrets
 from typing import Any
 
 from dipn_jax.errors import UserError
@@ -36,7 +37,8 @@ def file_sha256(path: pathlib.Path) -> str:
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
     """Write under a temporary name, sync, rename."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # workers in containers may share process numbers
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("wb") as stream:
             stream.write(data)

@@ -12,6 +12,8 @@ from dipn_jax import geometry, shapes
 
 ROWS = 3
 """Most rows of a scene."""
+MOST = 4 * ROWS
+"""Objects that there is room for: four in a row."""
 GAPS = (0.0005, 0.004)
 """Metres between neighbours, least and most; a finger is thicker."""
 REACH = 0.13

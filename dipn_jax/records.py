@@ -193,7 +193,9 @@ def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         manifest = json.loads(path.read_text())
-        manifest["shards"].items()
+        for entry in manifest["shards"].values():
+            if not {"bytes", "sha256", "episodes", "faults"} <= set(entry):
+                raise KeyError
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"data set {folder}: no {MANIFEST}; give a folder that dipn-datagen wrote") from None
     except (ValueError, KeyError, TypeError, AttributeError):

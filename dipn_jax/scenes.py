@@ -79,6 +79,11 @@ class SceneConfig:
             )
         if min(self.counts) < 0 or sum(self.counts) <= 0:
             raise UserError(f"scene config: counts {self.counts} are not probabilities; want non-negative, sum > 0")
+        if self.ranges.packed and len(self.counts) > packing.MOST:
+            raise UserError(
+                f"--packed with up to {len(self.counts)} objects: no more than {packing.MOST} stand in rows; "
+                "give fewer objects, or --packed 0"
+            )
 
 
 PAPER = SceneConfig()

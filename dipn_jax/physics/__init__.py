@@ -22,6 +22,8 @@ EngineName = Literal["auto", "native", "mjx", "warp"]
 
 CONTROL_PERIOD = 0.01
 """Seconds between set points; faults are looked for as often."""
+MOST_SUBSTEPS = 100
+"""Time steps in a control period at most."""
 FENCE = 0.17
 """Metres from the workspace's centre along x or y beyond which a fence pushes centres of mass back."""
 FENCE_RATE = 30.0
@@ -59,9 +61,11 @@ def substeps(config: PhysicsConfig) -> int:
     Raises:
       UserError: that is not a whole number.
     """
-    count = round(CONTROL_PERIOD / config.timestep) if config.timestep > 0 else 0
+    count = round(CONTROL_PERIOD / config.timestep) if config.timestep >= CONTROL_PERIOD / MOST_SUBSTEPS else 0
     if count < 1 or abs(count * config.timestep - CONTROL_PERIOD) > 1e-9:
-        raise UserError(f"physics timestep {config.timestep}: want {CONTROL_PERIOD} over a whole number")
+        raise UserError(
+            f"physics timestep {config.timestep}: want {CONTROL_PERIOD} over a whole number from 1 to {MOST_SUBSTEPS}"
+        )
     return count
 
 
@@ -111,7 +115,10 @@ class Stopped(Exception):
 
 
 def resolve(name: EngineName) -> EngineName:
-    """`auto` is `native`, or `mjx` on an accelerator whose host has few cores (ENOUGH_CORES)."""
+    """`auto` is `native`, or `mjx` on an accelerator whose host has few cores (ENOUGH_CORES).
+
+    Never `warp`, though it is faster there: it is an extra, and its scenes share their room for contacts.
+    """
     if name == "auto":
         return "native" if jax.default_backend() == "cpu" or cores() >= ENOUGH_CORES else "mjx"
     return name

@@ -172,7 +172,7 @@ def _line_search(
         high = jnp.minimum(high, jnp.where(first < 0, jnp.inf, tries).min())
         steep = jnp.where(jnp.isfinite(first), jnp.abs(first), jnp.inf)
         best = steep.argmin()
-        found = (steep[best] <= FLAT * jnp.abs(begin)) | (high - low <= NARROW * high)
+        found = (steep[best] <= FLAT * jnp.abs(begin)) | (jnp.isfinite(high) & (high - low <= NARROW * high))
         guess = tries[best] - first[best] / second[best]
         end = jnp.where(jnp.isfinite(high), high, STRETCH * low)
         start = jnp.where(low > 0, low, TRIES[0] * high)

@@ -39,7 +39,7 @@ def program(
 
     Returns:
       A function of as many arrays. Traces lie in `traced` in the folder of JAX's compilation cache; without such a
-      folder nothing is kept. A file that cannot be read is written anew.
+      folder, or where it cannot be written, nothing is kept. A file that cannot be read is written anew.
     """
     shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.asarray(leaf).dtype) for leaf in arguments]
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
@@ -53,6 +53,9 @@ def program(
         # JAX finds LAPACK when it lowers something that calls it; a program lowered elsewhere would call nothing
         jax.block_until_ready(jax.numpy.linalg.cholesky(jax.numpy.eye(2)))
     except Exception:  # not there or damaged: what a damaged one raises is not documented
-        traced = export.export(jax.jit(function))(*shapes)
-        files.write_atomically(path, bytes(traced.serialize()))
+        try:
+            traced = export.export(jax.jit(function))(*shapes)
+            files.write_atomically(path, bytes(traced.serialize()))
+        except (OSError, ValueError):  # a folder that is not for us to write, a device whose programs cannot be kept
+            return jax.jit(function, donate_argnums=tuple(donate))
     return jax.jit(traced.call, donate_argnums=tuple(donate))

@@ -70,7 +70,9 @@ class MjxEngine:
             raise UserError(f"mjx: chunk {chunk}; want a power of two")
         on_cpu = self.devices[0].platform == "cpu"
         self.chunk, self.batch = chunk or (16 if on_cpu else 1024), 64 if on_cpu else 1024
-        self.programs: dict[tuple[int, int], Callable[..., Rollout]] = {}  # by number of scenes and of slots
+        self.programs: dict[
+            tuple[int, ...], Callable[..., Rollout]
+        ] = {}  # by number of scenes, slots, instants, frames
         self._stopped, self._lock = threading.Event(), threading.Lock()
 
     def simulate(
@@ -106,11 +108,12 @@ class MjxEngine:
 
     def _program(self, size: int, slots: int, arguments: tuple[Any, ...]) -> Callable[..., Rollout]:
         """The compiled function for `size` scenes of `slots` objects: each device runs its share by itself."""
-        if (size, slots) not in self.programs:
+        key = size, slots, len(arguments[4]), arguments[2].time.shape[1]
+        if key not in self.programs:
             made = _Program(self.config, slots, self.substeps)
             alone = len(self.devices) == 1 and self.devices[0].platform == jax.default_backend()
-            self.programs[size, slots] = self._kept(made, arguments) if alone else self._shared(made)
-        return self.programs[size, slots]
+            self.programs[key] = self._kept(made, arguments) if alone else self._shared(made)
+        return self.programs[key]
 
     def _shared(self, made: _Program) -> Callable[..., Rollout]:
         """On all devices."""

@@ -88,6 +88,10 @@ def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
     assert json.loads((copy / "config.json").read_text())["episodes"] == 32
     with pytest.raises(UserError, match="begun with 32 episodes, asked for 24"):
         generate(JOB, copy)
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps(config | {"episodes": None}))
+    with pytest.raises(UserError, match="episodes None, want a whole number"):
+        generate(JOB, copy)
 
 
 def test_a_shard_does_not_depend_on_how_many_others_there_are(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
@@ -113,7 +117,7 @@ def test_nonsense_is_refused(tmp_path: pathlib.Path) -> None:
     for distances in ((), (0.2,), (0.05, float("nan"))):
         with pytest.raises(UserError, match="--distances"):
             dataclasses.replace(JOB, distances=distances)
-    for timestep in (-0.002, 0.004, 0.0):
+    for timestep in (-0.002, 0.004, 0.0, 1e-9, 1e-320):
         with pytest.raises(UserError, match="timestep"):
             generate(dataclasses.replace(JOB, timestep=timestep), tmp_path / "x")
     with pytest.raises(UserError, match="--seed"):

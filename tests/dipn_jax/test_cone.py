@@ -68,3 +68,14 @@ def test_a_second_registration_changes_nothing() -> None:
     once = cone.solver.solve
     cone.register()
     assert cone.solver.solve is once
+
+
+@pytest.mark.parametrize("multiple", [1e-3, 0.3, 1.0, 10.0, 1000.0])
+def test_the_line_search_finds_minima_near_and_far(multiple: float) -> None:
+    p = _problem(np.random.default_rng(1), sticking=False)
+    p = p.replace(weight=np.zeros(ROWS, np.float32), stiffness=np.zeros(CONES, np.float32))  # a parabola
+    step = (p.free / multiple).astype(np.float32)
+    slope = -p.force @ step
+    found = jax.jit(cone._line_search)(p, np.zeros(V, np.float32), step, slope, 50, np.bool_(False))
+    assert abs(found / multiple - 1) < 0.1
+    assert jax.jit(cone._line_search)(p, np.zeros(V, np.float32), step, slope, 50, np.bool_(True)) == 0

@@ -47,6 +47,12 @@ def test_a_program_is_traced_once_unless_anything_differs_or_its_file_is_damaged
     assert traced == ["a", "b", "a", "a"]
 
 
+def test_a_folder_that_cannot_be_written_keeps_nothing_and_breaks_nothing(cache: pathlib.Path) -> None:
+    cache.write_text("a file in the folder's place")
+    (found,) = kept.program(lambda x: (x + 1,), [np.zeros(2)], what="", donate=())(np.zeros(2))
+    assert found.tolist() == [1, 1]
+
+
 def test_without_a_cache_nothing_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path) -> None:
     monkeypatch.chdir(tmp_path)
     before = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]

@@ -2,8 +2,10 @@
 
 import jax
 import numpy as np
+import pytest
 
 from dipn_jax import geometry, packing, scenes
+from dipn_jax.errors import UserError
 from dipn_jax.scenes import Ranges
 
 PACKED = scenes.parse_objects("6", ranges=Ranges(packed=1.0))
@@ -36,3 +38,10 @@ def test_a_share_of_scenes_is_packed() -> None:
     _, poses = jax.vmap(lambda key: scenes.random_scene(key, config=config))(keys)
     low = (np.sort(np.asarray(poses)[..., 2], 1)[:, -2] < 0.1).mean()
     assert 0.3 < low < 0.7
+
+
+def test_more_objects_than_stand_in_rows_are_refused() -> None:
+    ranges = Ranges(packed=0.1)
+    assert scenes.parse_objects("3:12", ranges=ranges).slots == packing.MOST
+    with pytest.raises(UserError, match=r"--packed with up to 13 objects: no more than 12"):
+        scenes.parse_objects("13", ranges=ranges)

@@ -108,3 +108,14 @@ def test_a_write_that_dies_leaves_the_old_file(tmp_path: pathlib.Path, monkeypat
         files.write_json(path, {"a": 2})
     assert json.loads(path.read_text()) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["manifest.json"]
+
+
+@pytest.mark.parametrize("gone", ["bytes", "sha256", "episodes", "faults"])
+def test_a_manifest_without_some_of_its_keys_is_damaged(copy: pathlib.Path, gone: str) -> None:
+    manifest = json.loads((copy / "manifest.json").read_text())
+    for entry in manifest["shards"].values():
+        del entry[gone]
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    for look in (records.verify, records.summary):
+        with pytest.raises(UserError, match=r"manifest\.json is damaged; run dipn-datagen repair"):
+            look(copy)
