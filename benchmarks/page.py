@@ -10,18 +10,26 @@ from benchmarks.__main__ import BENCHMARKS
 from benchmarks.harness import Figures
 from dipn_jax import console, files
 
+SETTINGS = "datagen_mjx.settings"
+COLUMNS = ("time", "p50_mm", "p90_mm", "grasps_equal", "faults")
+"""Of its table."""
+
 
 def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
 def tables(figures: Figures) -> str:
-    """Ratios with their goals, then episodes a second, as Markdown."""
+    """Ratios with their goals, then episodes a second, then what other settings of MJX cost, as Markdown."""
     ratios = [_row(["figure", "goal", "value"]), _row(["---"] * 3)]
     rates: dict[str, dict[int, float]] = {}
+    variants: dict[str, dict[str, float]] = {}
     for name, value in figures.items():
         base = next(known for known in BENCHMARKS if name == known or name.startswith((f"{known}/", f"{known}.")))
-        if base.startswith("rates."):
+        if base == SETTINGS:
+            _, variant, key = name.split("/")
+            variants.setdefault(variant, {})[key] = value
+        elif base.startswith("rates."):
             kind, _, count = name.removeprefix("rates.").rpartition("/")
             rates.setdefault(kind.replace("/", ", "), {})[int(count)] = value
         else:
@@ -31,7 +39,10 @@ def tables(figures: Figures) -> str:
     speeds = [_row(["episodes a second", *map(str, counts)]), _row(["---"] * (len(counts) + 1))]
     for kind, row in rates.items():
         speeds.append(_row([kind, *(f"{row[count]:.3g}" if count in row else "" for count in counts)]))
-    return "\n\n".join("\n".join(table) for table in (ratios, speeds) if len(table) > 2) + "\n"
+    others = [_row(["MJX with", *COLUMNS]), _row(["---"] * (len(COLUMNS) + 1))]
+    for variant, found in variants.items():
+        others.append(_row([f"`{variant}`", *(f"{found[key]:.3g}" if key in found else "" for key in COLUMNS)]))
+    return "\n\n".join("\n".join(table) for table in (ratios, speeds, others) if len(table) > 2) + "\n"
 
 
 def merged(paths: Sequence[pathlib.Path]) -> Figures:
