@@ -215,6 +215,18 @@ def test_contacts_that_are_left_out_are_a_fault() -> None:
     assert primitives.settle(cramped, box, pose, duration=0.02).fault[0] & Fault.CAPACITY
 
 
+def test_pairs_that_are_left_out_are_a_fault(engine: MjxEngine) -> None:
+    few = MjxEngine(dataclasses.replace(mjx.DEFAULTS, geom_pairs=(1, 0)))
+    size, full = np.full((BATCH, SLOTS, 3), 0.05, np.float32), np.full((BATCH, SLOTS), 0.35, np.float32)
+    boxes = Scene(np.zeros((BATCH, SLOTS), np.int32), size, np.zeros_like(size), full, full)
+    boxes.shape[1:, 1:] = ABSENT  # only the first scene has a pair, in fact two
+    row = np.tile(np.array([0, 0, 0.025, 1, 0, 0, 0], np.float32), (BATCH, SLOTS, 1))
+    row[..., 0] = 0.0502 * np.arange(SLOTS)
+    for each, wanted in ((few, [True, False, False, False]), (engine, [False] * BATCH)):
+        fault = primitives.settle(each, boxes, row, duration=0.02).fault
+        assert ((fault & Fault.CAPACITY) > 0).tolist() == wanted
+
+
 def test_a_timestep_that_does_not_divide_the_control_period_is_refused() -> None:
     with pytest.raises(UserError, match=r"timestep 0\.004"):
         MjxEngine(dataclasses.replace(mjx.DEFAULTS, timestep=0.004))
