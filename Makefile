@@ -36,7 +36,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# ratios, and episodes a second on this machine, for docs/benchmarks.md (30 minutes on 2 idle cores)
+# ratios, and episodes a second on this machine, for docs/benchmarks.md (hours on 2 idle cores)
 bench: setup
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,bench]'
 	$(BIN)/python -m benchmarks all --scale full --out benchmarks.json
