@@ -1,4 +1,4 @@
-# make demo   set up, then generate, train, clear tables and write demo/report.html (15 minutes on 2 cores)
+# make demo   set up, then generate, train, clear tables and write demo/report.html (10 minutes on 2 cores)
 # make test   lint, types, tests
 # make bench  the figures of docs/benchmarks.md
 # make push-figures, make grasp-figures, make clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
