@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import pathlib
 from collections.abc import Callable, Sequence
@@ -17,13 +16,16 @@ from dipn_jax.structs import Array
 _SOURCES = pathlib.Path(__file__).parent.parent
 
 
-@functools.cache
 def _versions() -> str:
     """What every trace depends on: our sources and the packages."""
     digest = hashlib.sha256(str(files.package_versions()).encode())
     for path in sorted(_SOURCES.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+_BEGUN_WITH = _versions()
+"""Read while the sources are imported: who edits them later does not change what this process traces."""
 
 
 def program(
@@ -45,7 +47,7 @@ def program(
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not cache:
         return jax.jit(function, donate_argnums=tuple(donate))
-    about = [_versions(), jax.default_backend(), str(jax.config.read("jax_enable_x64")), what, str(shapes)]
+    about = [_BEGUN_WITH, jax.default_backend(), str(jax.config.read("jax_enable_x64")), what, str(shapes)]
     key = hashlib.sha256("\n".join(about).encode()).hexdigest()
     path = pathlib.Path(cache) / "traced" / key
     try:
