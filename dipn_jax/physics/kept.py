@@ -52,12 +52,13 @@ def program(
     path = pathlib.Path(cache) / "traced" / key
     try:
         traced = export.deserialize(bytearray(path.read_bytes()))
-        # JAX finds LAPACK when it lowers something that calls it; a program lowered elsewhere would call nothing
-        jax.block_until_ready(jax.numpy.linalg.cholesky(jax.numpy.eye(2)))
     except Exception:  # not there or damaged: what a damaged one raises is not documented
         try:
             traced = export.export(jax.jit(function))(*shapes)
             files.write_atomically(path, bytes(traced.serialize()))
         except (OSError, ValueError):  # a folder that is not for us to write, a device whose programs cannot be kept
             return jax.jit(function, donate_argnums=tuple(donate))
+    else:
+        # JAX finds LAPACK when it lowers something that calls it; a program lowered elsewhere would crash without
+        jax.block_until_ready(jax.numpy.linalg.cholesky(jax.numpy.eye(2)))
     return jax.jit(traced.call, donate_argnums=tuple(donate))

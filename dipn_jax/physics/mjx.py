@@ -70,9 +70,8 @@ class MjxEngine:
             raise UserError(f"mjx: chunk {chunk}; want a power of two")
         on_cpu = self.devices[0].platform == "cpu"
         self.chunk, self.batch = chunk or (16 if on_cpu else 1024), 64 if on_cpu else 1024
-        self.programs: dict[
-            tuple[int, ...], Callable[..., Rollout]
-        ] = {}  # by number of scenes, slots, instants, frames
+        # by number of scenes, slots, instants and key frames
+        self.programs: dict[tuple[int, ...], Callable[..., Rollout]] = {}
         self._stopped, self._lock = threading.Event(), threading.Lock()
 
     def simulate(

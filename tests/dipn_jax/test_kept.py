@@ -53,10 +53,8 @@ def test_a_folder_that_cannot_be_written_keeps_nothing_and_breaks_nothing(cache:
     assert found.tolist() == [1, 1]
 
 
-def test_without_a_cache_nothing_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+def test_without_a_cache_nothing_is_kept(cache: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(cache.parent)
     jax.config.update("jax_compilation_cache_dir", None)
     (found,) = kept.program(lambda x: (x + 1,), [np.zeros(2)], what="", donate=())(np.zeros(2))
-    jax.config.update("jax_compilation_cache_dir", before)
-    assert found.tolist() == [1, 1] and not list(tmp_path.iterdir())
+    assert found.tolist() == [1, 1] and not list(cache.parent.iterdir())
