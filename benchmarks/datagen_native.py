@@ -14,7 +14,6 @@ from mujoco import batch as mujoco_batch
 from benchmarks.harness import Setting, alternate, make_data
 from datagen.generate import Job
 from dipn_jax import scenes
-from dipn_jax.physics import native
 
 ACTIONS = {"push": 3, "grasp": 6}
 """Actions tried on one scene: what the commands do unasked."""
@@ -27,8 +26,8 @@ INPUTS = ("ctrl", "qfrc_applied")
 class Tape:
     """One batch of simulations: how it began, what was set before each call of `step`, how it ended."""
 
-    models: list[Any]
     nthread: int
+    models: list[Any] = dataclasses.field(default_factory=list)
     start: np.ndarray | None = None  # [B, nq]
     calls: list[tuple[dict[str, np.ndarray], dict[str, Any]]] = dataclasses.field(default_factory=list)
     end: np.ndarray | None = None  # [B, nq]
@@ -39,14 +38,18 @@ def recording() -> Iterator[list[Tape]]:
     """Within it, the native engine keeps a tape of every batch it simulates."""
     tapes: list[Tape] = []
 
-    class Recorder(native._Worlds):
-        def __init__(self, models: list[Any], engine: native.NativeEngine) -> None:
-            super().__init__(models, engine)
-            self._tape = Tape(models, engine.threads)
-            tapes.append(self._tape)
+    class Recorder(mujoco_batch.Batch):
+        def __init__(self, model: Any, **options: Any) -> None:
+            super().__init__(model, **options)
+            self.tape = Tape(options["nthread"])
+            tapes.append(self.tape)
+
+        def set_models(self, models: Any) -> None:
+            super().set_models(models)
+            self.tape.models = models
 
         def step(self, **options: Any) -> None:
-            tape = self._tape
+            tape = self.tape
             if tape.start is None:
                 tape.start = np.array(self.qpos)
             tape.calls.append(({name: np.array(getattr(self, name)) for name in INPUTS}, options))
@@ -55,7 +58,7 @@ def recording() -> Iterator[list[Tape]]:
             finally:
                 tape.end = np.array(self.qpos)
 
-    with mock.patch.object(native, "_Worlds", Recorder):
+    with mock.patch.object(mujoco_batch, "Batch", Recorder):
         yield tapes
 
 

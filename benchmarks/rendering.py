@@ -33,8 +33,7 @@ class RayCaster:
 
     def __init__(self, items: SettledScene) -> None:
         """Everything that can be made ready before the rays."""
-        library = model.mesh_library(items.scene)
-        texts = [model.mjcf(structs.take(items.scene, i), config=model.PhysicsConfig(), library=library)
+        texts = [model.mjcf(structs.take(items.scene, i), config=model.PhysicsConfig(), alike=True)
                  for i in range(len(items.fault))]  # fmt: skip
         models = [mujoco.MjModel.from_xml_string(text) for text in texts]
         self.sims = mujoco_batch.Batch(models[0], nsim=len(models), nthread=cores())

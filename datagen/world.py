@@ -126,8 +126,8 @@ def pushes(engine: Engine, made: Trial) -> tuple[Metrics, np.ndarray]:
 
 def _depths(made: Trial, poses: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     """Deepest contact `[B]` (metres) among objects, table and gripper: one that tunnels is deep on its way."""
-    scene, library = made.items.scene, model.mesh_library(made.items.scene)
-    texts = [model.mjcf(structs.take(scene, i), config=native.DEFAULTS, library=library) for i in range(len(poses))]
+    scene = made.items.scene
+    texts = [model.mjcf(structs.take(scene, i), config=native.DEFAULTS, alike=True) for i in range(len(poses))]
     models = [mujoco.MjModel.from_xml_string(text) for text in texts]
     hand = np.concatenate([gripper[:, :4], gripper[:, 4:] / 2, gripper[:, 4:] / 2], -1)
     return native.contact_depths(models, np.concatenate([hand, poses.reshape(len(poses), -1)], -1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -15,6 +16,11 @@ from dipn_jax.errors import UserError
 
 def package_versions() -> dict[str, str]:
     """Versions of the packages that results depend on."""
+    return dict(_versions())
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
     names = ("dipn-jax", "jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
     found = {}
     for name in names:

@@ -118,17 +118,28 @@ def inertias(scene: Scene) -> np.ndarray:
     return np.where((np.asarray(scene.shape) >= 0)[:, None], inertia, 1e-4)
 
 
-def _fillers(scene: Scene, library: np.ndarray) -> str:
-    """Meshes that no geom uses, which bring the number of meshes of each class up to `library [C]`."""
+def _fillers(scene: Scene) -> str:
+    """Meshes that no geom uses: with them the bounding volumes of all meshes have as many nodes in every scene.
+
+    A hull of f triangles has 2 f - 1 nodes: of a prism of n sides, with f = 4 n - 4, and of v corners in general
+    position, with f = 2 v - 4, which makes 4 v - 9.
+    """
     shape = np.asarray(scene.shape)
-    rows = []
-    for index, name in enumerate(shapes.CLASSES):
-        if name == "cuboid":
-            continue
-        for i in range(int(library[index]) - int((shape == index).sum())):
-            for part in range(int((shapes.CORNERS_USED[index] > 0).sum())):
-                rows.append(_mesh(f"{name}{i}p{part}", index, part, np.full(3, 0.05)))
-    return "".join(rows)
+    sides = shapes.CORNERS_USED[np.maximum(shape, 0)]
+    meshes = (sides > 0) & ((shape >= 0) & (shape != shapes.CLASSES.index("cuboid")))[:, None]
+    most = len(shape) * (8 * shapes.CORNERS - 9)  # no object has more
+    missing = most + 28 - int((8 * sides - 9)[meshes].sum())  # from 28 on, any number can be made up
+    count = -missing % 4 or 4
+    corners = [4] * (count - 1) + [(missing + 9 * count) // 4 - 4 * (count - 1)]
+    return "".join(f'<mesh name="filler{i}" vertex="{_text(_ball(n))}"/>' for i, n in enumerate(corners))
+
+
+def _ball(count: int) -> np.ndarray:
+    """`count` corners `[V, 3]` on a sphere: a Fibonacci lattice, so that each is one of the hull's."""
+    at = np.arange(count) + 0.5
+    height, angle = 1 - 2 * at / count, np.pi * (1 + np.sqrt(5)) * at
+    ring = np.sqrt(1 - height**2)
+    return 0.05 * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], -1)
 
 
 def _mesh(name: str, shape: int, part: int, size: np.ndarray) -> str:
@@ -137,19 +148,13 @@ def _mesh(name: str, shape: int, part: int, size: np.ndarray) -> str:
     return f'<mesh name="{name}" vertex="{_text(vertices)}"/>'
 
 
-def mesh_library(scenes: Scene) -> np.ndarray:
-    """Meshes of each class `[C]` that models of `scenes [B, N]` need to share one memory layout."""
-    shape = np.asarray(scenes.shape)
-    return np.stack([(shape == c).sum(-1).max() for c in range(len(shapes.CLASSES))])
-
-
 def mjcf(
     scene: Scene,
     *,
     config: PhysicsConfig,
     gripper: Gripper = GRIPPER,
     generic: bool = False,
-    library: np.ndarray | None = None,
+    alike: bool = False,
 ) -> str:
     """The world as an MJCF document.
 
@@ -158,7 +163,7 @@ def mjcf(
       config: solver settings.
       gripper: dimensions and gains.
       generic: placeholder geometry in every part (see the module's docstring).
-      library: meshes of each class `[C]` to reach with unused ones (see `mesh_library`).
+      alike: add meshes that nothing uses, so that models of any scenes with as many slots share one memory layout.
 
     Returns:
       XML text. qpos is `[x, y, z, yaw, left, right, (position, quaternion) of every slot]`.
@@ -176,9 +181,10 @@ def mjcf(
                 f'<pair geom1="floor" geom2="o{i}p{part}" condim="3" friction="{mu:.9g} {mu:.9g} 0.005 0.0001 0.0001"'
                 f' solref="{config.solref}" solimp="{config.solimp}"{gap}/>'
             )
-    extra = "" if library is None else _fillers(scene, library)
+    extra = _fillers(scene) if alike else ""
     if generic:
         extra = _mesh("part", shapes.CLASSES.index("cylinder"), 0, np.full(3, 0.05))
+    nearest = "" if generic else '<sensor><contact name="nearest" data="dist" reduce="mindist" num="1"/></sensor>'
     pairs, contacts = config.caps(n)
     c, sleep = config, ' sleep="enable"' if config.sleep else ""
     return f"""<mujoco model="dipn">
@@ -201,4 +207,4 @@ def mjcf(
 <contact>{"".join(floor)}</contact>
 <equality><joint joint1="left" joint2="right" polycoef="0 1 0 0 0" solref="0.005 1"/></equality>
 <actuator>{_actuators(gripper)}</actuator>
-</mujoco>"""
+{nearest}</mujoco>"""

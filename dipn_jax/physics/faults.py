@@ -16,6 +16,11 @@ REST_SPEED = 0.02
 """m/s (and, times the size of an object, the bound on rotation) below which a scene is at rest."""
 MAX_SINK = 0.004
 """Metres that the lowest corner of an object may be under the table, or an object inside another."""
+MAX_DEPTH = 0.01
+"""Metres that a contact may be deep on the way, unless a fence is up: heaps that fall are pressed together by their
+impacts (30 objects: 14 mm at half of the drops) and part again. Measured on 1 to 30 objects: pushes at most 3.6 mm, 99 %
+of grasps at most 5 mm, the worst (a finger on an object that cannot give way) 19 mm.
+"""
 MAX_SHORT = 0.01
 """Metres by which a gripper may miss its last set point."""
 MAX_STRAY = 0.015
@@ -53,6 +58,7 @@ def codes(
     broken: Array,
     full: Array,
     depth: Array,
+    deepest: Array,
     settle: Array | bool,
     xp: ModuleType = jnp,
 ) -> Array:
@@ -69,6 +75,7 @@ def codes(
       broken: `[B]` bool: something was not finite on the way.
       full: `[B]` bool: contacts, or pairs of geoms, were left out on the way.
       depth: `[B]` metres: deepest contact now.
+      deepest: `[B]` metres: deepest contact on the way, while no fence was up.
       settle: whether everything has to be at rest.
       xp: numpy or jax.numpy.
 
@@ -85,7 +92,7 @@ def codes(
         (Fault.UNSETTLED, settle & (_fastest(scenes, velocity, xp) > REST_SPEED)),
         (Fault.OUTSIDE, outside.any(-1)),
         (Fault.SPEED, top > MAX_SPEED),
-        (Fault.PENETRATION, sunk.any(-1) | (depth > MAX_SINK)),
+        (Fault.PENETRATION, sunk.any(-1) | (depth > MAX_SINK) | (deepest > MAX_DEPTH)),
         (Fault.SHORT, ~((off_path(hand, target, xp=xp) <= MAX_SHORT) & (stray <= MAX_STRAY))),
     )
     return sum((xp.where(where, bit, 0) for bit, where in flags), xp.zeros(len(present), xp.int32))

@@ -35,8 +35,12 @@ class Worlds(Protocol):
         """Simulate one control period; returns which simulations (indices) failed, and which ran out of memory."""
         ...
 
+    def last_depths(self) -> np.ndarray:
+        """Deepest contact `[B]` in metres of the last step, but for those among objects asleep."""
+        ...
+
     def depths(self) -> np.ndarray:
-        """Deepest contact `[B]` in metres, now."""
+        """Deepest contact `[B]` in metres now."""
         ...
 
 
@@ -52,33 +56,38 @@ def follow(
     fence: float,
 ) -> Rollout:
     """Run `sims` along `trajectories`; arguments as `Engine.simulate`, but for `scenes` and `slots`, from `pack`."""
-    watch, present = Watch(scenes, sims), scenes.shape >= 0
+    present = scenes.shape >= 0
     mass = np.where(present, scenes.mass, 0.0)
     ticks = np.round(samples / physics.CONTROL_PERIOD).astype(int)
-    stored = []
-    for tick in range(int(ticks[-1]) + 1):
+    last = int(ticks[-1])
+    times = np.arange(last + 1) * physics.CONTROL_PERIOD
+    ahead, now = (controls(trajectories, t) for t in (times + GRIPPER.lag, times))
+    watch, stored = Watch(scenes, sims), []
+    for tick in range(last + 1):
         if tick in ticks:
-            now = unpack(sims.qpos[:, GRIPPER_DOF:], poses, slots, present), gripper(sims.qpos)
-            stored += [now] * int((ticks == tick).sum())
-        if tick < ticks[-1]:
-            time = tick * physics.CONTROL_PERIOD
-            sims.ctrl[:] = controls(trajectories, time + GRIPPER.lag)
+            state = unpack(sims.qpos[:, GRIPPER_DOF:], poses, slots, present), gripper(sims.qpos)
+            stored += [state] * int((ticks == tick).sum())
+        if tick < last:
+            sims.ctrl[:] = ahead[tick]
             if fence:
-                hold_in(sims, mass, up=time < fence)
+                hold_in(sims, mass, up=times[tick] < fence)
             watch.raised(*sims.advance())
-            watch.tick(controls(trajectories, time + physics.CONTROL_PERIOD))
-    fault = watch.codes(controls(trajectories, float(samples[-1])), settle)
+            watch.tick(now[tick + 1], fenced=times[tick] < fence)
+    fault = watch.codes(now[last], settle)
     rollout, hand = (np.stack(part, 1).astype(np.float32) for part in zip(*stored, strict=True))
     return Rollout(rollout, hand, fault)
 
 
 class Watch:
-    """Collects faults while a batch runs."""
+    """Collects faults while a batch runs. What was not finite once stays so."""
 
     def __init__(self, scenes: Scene, sims: Worlds) -> None:
         self.scenes, self.sims = scenes, sims
-        self.broken, self.full = np.zeros((2, len(scenes.shape)), bool)
-        self.top, self.stray = np.zeros((2, len(scenes.shape)))
+        batch, slots = scenes.shape.shape
+        self.broken, self.full = np.zeros((2, batch), bool)
+        self.fastest = np.zeros((batch, slots))  # (m/s)^2: highest so far
+        self.off = np.zeros((batch, 3))  # metres: farthest that the hand was off its path
+        self.deepest = np.zeros(batch)  # metres: contact, without a fence
 
     def raised(self, failed: np.ndarray, full: np.ndarray) -> None:
         """Note simulations that the engine gave up."""
@@ -86,32 +95,35 @@ class Watch:
 
     def velocity(self) -> np.ndarray:
         """Of the objects `[B, N, 6]`."""
-        return np.array(self.sims.qvel[:, GRIPPER_DOF:]).reshape(*self.scenes.shape.shape, 6)
+        return np.asarray(self.sims.qvel)[:, GRIPPER_DOF:].reshape(*self.scenes.shape.shape, 6)
 
-    def tick(self, target: np.ndarray) -> None:
-        """Note speeds, and how far the hand is off its `target [B, 6]`."""
-        linear = faults.speed(self.scenes, self.velocity(), xp=np)
-        finite = np.isfinite(linear).all(-1)
-        self.broken |= ~finite
-        self.top = np.maximum(self.top, np.where(finite, linear.max(-1), 0.0))
-        off = faults.off_path(np.array(self.sims.qpos[:, :3]), target[:, :3], xp=np)
-        self.stray = np.maximum(self.stray, np.where(np.isfinite(off), off, np.inf))
+    def tick(self, target: np.ndarray, *, fenced: bool) -> None:
+        """Note speeds, depths (unless `fenced`), and how far the hand is off its `target [B, 6]`."""
+        linear = self.velocity()[..., :3]
+        np.maximum(self.fastest, np.einsum("bnk,bnk->bn", linear, linear), out=self.fastest)
+        np.maximum(self.off, np.abs(np.asarray(self.sims.qpos)[:, :3] - target[:, :3]), out=self.off)
+        if not fenced:
+            np.fmax(self.deepest, self.sims.last_depths(), out=self.deepest)
 
     def codes(self, target: np.ndarray, settle: bool) -> np.ndarray:
         """Fault codes `[B]` at the end of a rollout."""
         warning = np.asarray(self.sims.warning)[..., 1]  # (last info, count)
         qpos = np.array(self.sims.qpos)
+        present = self.scenes.shape >= 0
+        finite = np.isfinite(self.fastest)
+        stray = self.off.max(-1)
         return faults.codes(
             self.scenes,
-            qpos[:, GRIPPER_DOF:].reshape(*self.scenes.shape.shape, 7),
+            qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7),
             self.velocity(),
             qpos[:, :3],
             target[:, :3],
-            top=self.top,
-            stray=self.stray,
-            broken=self.broken | (warning[:, _BAD] > 0).any(-1),
+            top=np.sqrt(np.where(present & finite, self.fastest, 0.0)).max(-1),
+            stray=np.where(np.isfinite(stray), stray, np.inf),
+            broken=self.broken | (present & ~finite).any(-1) | (warning[:, _BAD] > 0).any(-1),
             full=self.full | (warning[:, _FULL] > 0).any(-1),
             depth=np.where(self.broken, 0.0, self.sims.depths()),
+            deepest=self.deepest,
             settle=settle,
             xp=np,
         )
@@ -149,15 +161,16 @@ def hold_in(sims: Worlds, mass: np.ndarray, *, up: bool) -> None:
     sims.qfrc_applied[:, GRIPPER_DOF:] = force.reshape(len(force), -1)
 
 
-def controls(trajectories: Trajectory, time: float) -> np.ndarray:
-    """Actuator set points `[B, 6]` at `time`: linear between key frames, gap split over both fingers."""
+def controls(trajectories: Trajectory, time: np.ndarray) -> np.ndarray:
+    """Actuator set points `[T, B, 6]` at `time [T]`: linear between key frames, gap split over both fingers."""
     times, targets = trajectories.time, trajectories.target
-    index = np.clip((times <= time).sum(-1) - 1, 0, times.shape[1] - 2)
+    when = time[:, None]
+    index = np.clip((times <= when[..., None]).sum(-1) - 1, 0, times.shape[1] - 2)
     rows = np.arange(len(times))
     t0, t1 = times[rows, index], times[rows, index + 1]
-    weight = np.clip((time - t0) / np.maximum(t1 - t0, 1e-9), 0.0, 1.0)[:, None]
+    weight = np.clip((when - t0) / np.maximum(t1 - t0, 1e-9), 0.0, 1.0)[..., None]
     pose = targets[rows, index] * (1 - weight) + targets[rows, index + 1] * weight
-    return np.concatenate([pose[:, :4], pose[:, 4:] / 2, pose[:, 4:] / 2], -1)
+    return np.concatenate([pose[..., :4], pose[..., 4:] / 2, pose[..., 4:] / 2], -1)
 
 
 def gripper(qpos: np.ndarray) -> np.ndarray:

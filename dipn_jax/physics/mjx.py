@@ -207,15 +207,18 @@ class _Program:
         mass = jnp.where(present, scenes.mass, 0.0)
         target = functools.partial(recording.control, trajectories)
         state = jax.vmap(self._initial)(start, target(0.0))
-        record = Record(*room, jnp.zeros(len(poses)), jnp.zeros(len(poses)), jnp.zeros(len(poses), bool))
+        none = jnp.zeros(len(poses))
+        record = Record(*room, top=none, stray=none, broken=none > 0, deepest=none)
 
         def body(tick: jax.Array, carry: tuple[State, Record]) -> tuple[State, Record]:
             state, record = carry
             record = recording.store(record, state, ticks == tick)
             ctrl = target(tick * physics.CONTROL_PERIOD + GRIPPER.lag)
-            force = jnp.where(tick * physics.CONTROL_PERIOD < fence, recording.hold_in(mass, state), 0.0)
+            fenced = tick * physics.CONTROL_PERIOD < fence
+            force = jnp.where(fenced, recording.hold_in(mass, state), 0.0)
             state = jax.vmap(self._tick)(fields, state, ctrl, force)
-            return state, recording.watch(record, state, scenes, target((tick + 1) * physics.CONTROL_PERIOD))
+            due = target((tick + 1) * physics.CONTROL_PERIOD)
+            return state, recording.watch(record, state, scenes, due, fenced=fenced)
 
         last = ticks.max()
         state, record = jax.lax.fori_loop(0, last, body, (state, record))
@@ -232,6 +235,7 @@ class _Program:
             broken=record.broken,
             full=state.full,
             depth=state.depth,
+            deepest=record.deepest,
             settle=settle,
         )
         kept = jnp.where(present[:, None, :, None], record.poses, poses[:, None])

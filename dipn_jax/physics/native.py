@@ -34,8 +34,7 @@ class NativeEngine:
     def __init__(self, config: PhysicsConfig = DEFAULTS, *, threads: int | None = None) -> None:
         self.config, self.substeps = config, physics.substeps(config)
         self.threads = threads or physics.cores()
-        self.stopped, self.stepping, self._building = threading.Event(), threading.Lock(), threading.Lock()
-        self._library: dict[int, np.ndarray] = {}  # by number of objects: the most meshes of each class met so far
+        self.stopped, self._building = threading.Event(), threading.Lock()
         self._models: collections.OrderedDict[bytes, mujoco.MjModel] = collections.OrderedDict()
 
     def simulate(
@@ -59,7 +58,7 @@ class NativeEngine:
             packed.shape[..., None] >= 0, np.take_along_axis(poses, slots[..., None], 1), parked(packed.shape.shape[1])
         )
         sims.qpos[:, GRIPPER_DOF:] = start.reshape(len(models), -1)
-        sims.qpos[:, :GRIPPER_DOF] = hosted.controls(trajectories, 0.0)
+        sims.qpos[:, :GRIPPER_DOF] = hosted.controls(trajectories, np.zeros(1))[0]
         return hosted.follow(sims, packed, slots, poses, trajectories, np.asarray(samples), settle=settle, fence=fence)
 
     def stop(self) -> None:
@@ -68,16 +67,13 @@ class NativeEngine:
 
     def _compile(self, scenes: Scene) -> list[mujoco.MjModel]:
         """One model a scene; that of a scene met a short while ago (it settled, now it is pushed) is at hand."""
-        slots = scenes.shape.shape[1]
-        library = np.maximum(model.mesh_library(scenes), self._library.get(slots, 0))
-        self._library[slots] = library
 
         def compiled(i: int) -> mujoco.MjModel:
             scene = jax.tree.map(lambda leaf: leaf[i], scenes)
-            return mujoco.MjModel.from_xml_string(model.mjcf(scene, config=self.config, library=library))
+            return mujoco.MjModel.from_xml_string(model.mjcf(scene, config=self.config, alike=True))
 
         physical = (scenes.shape, scenes.size, scenes.mass, scenes.friction)
-        keys = [b"".join(leaf[i].tobytes() for leaf in physical) + library.tobytes() for i in range(len(scenes.shape))]
+        keys = [b"".join(leaf[i].tobytes() for leaf in physical) for i in range(len(scenes.shape))]
         missing = {key: i for i, key in enumerate(keys) if key not in self._models}
         with concurrent.futures.ThreadPoolExecutor(self.threads) as pool:
             self._models.update(zip(missing, pool.map(compiled, missing.values()), strict=True))
@@ -87,30 +83,40 @@ class NativeEngine:
         return models
 
 
-class _Worlds(mujoco_batch.Batch):
-    """See `hosted.Worlds`."""
+class _Worlds:
+    """See `hosted.Worlds`: views of a batch's fields."""
 
     def __init__(self, models: list[mujoco.MjModel], engine: NativeEngine) -> None:
+        self._engine, self._models = engine, models
         # persistent, for sleep
-        super().__init__(models[0], nsim=len(models), nthread=engine.threads, persistent=True)
-        self.set_models(models)
-        self._engine, self._models_kept = engine, models
+        self._batch = batch = mujoco_batch.Batch(models[0], nsim=len(models), nthread=engine.threads, persistent=True)
+        batch.set_models(models)
+        self.qpos, self.qvel, self.ctrl, self.qfrc_applied = map(batch.bind, ("qpos", "qvel", "ctrl", "qfrc_applied"))
+        self._nearest = batch.bind("sensordata")  # [B, 1] metres: the only sensor of `model.mjcf`
+
+    @property
+    def warning(self) -> np.ndarray:
+        """See `hosted.Worlds`."""
+        return np.asarray(self._batch.warning)
 
     def advance(self) -> tuple[np.ndarray, np.ndarray]:
-        """See `hosted.Worlds`. The engine is held no longer than that, so that other threads' batches go on too."""
+        """See `hosted.Worlds`."""
         if self._engine.stopped.is_set():
             raise physics.Stopped
         try:
-            with self._engine.stepping:
-                self.step(nstep=self._engine.substeps)
+            self._batch.step(nstep=self._engine.substeps)
         except mujoco_batch.SimulationError as error:
-            cramped = np.array(["memory" in self.error(int(i)) for i in error.ids], bool)
+            cramped = np.array(["memory" in self._batch.error(int(i)) for i in error.ids], bool)
             return np.asarray(error.ids)[~cramped], np.asarray(error.ids)[cramped]
         return np.zeros(0, int), np.zeros(0, int)
 
+    def last_depths(self) -> np.ndarray:
+        """See `hosted.Worlds`."""
+        return -self._nearest[:, 0]
+
     def depths(self) -> np.ndarray:
         """See `hosted.Worlds`."""
-        return contact_depths(self._models_kept, np.array(self.qpos))
+        return contact_depths(self._models, np.array(self.qpos))
 
 
 def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray) -> np.ndarray:
@@ -141,9 +147,8 @@ def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> t
       Heights `[B, pixels, pixels]` in metres and labels (object slots, ABSENT on the table) of the same shape.
     """
     scenes, poses = jax.tree.map(np.asarray, scenes), np.asarray(poses)
-    library = model.mesh_library(scenes)
     models = [
-        mujoco.MjModel.from_xml_string(model.mjcf(structs.take(scenes, i), config=PhysicsConfig(), library=library))
+        mujoco.MjModel.from_xml_string(model.mjcf(structs.take(scenes, i), config=PhysicsConfig(), alike=True))
         for i in range(len(poses))
     ]
     sims = mujoco_batch.Batch(models[0], nsim=len(models))

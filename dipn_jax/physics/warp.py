@@ -100,7 +100,7 @@ class WarpEngine:
         packed, slots = hosted.pack(scenes, poses)
         present = packed.shape >= 0
         start = np.where(present[..., None], np.take_along_axis(poses, slots[..., None], 1), parked(present.shape[1]))
-        qpos = np.concatenate([hosted.controls(paths, 0.0), start.reshape(len(start), -1)], -1)
+        qpos = np.concatenate([hosted.controls(paths, np.zeros(1))[0], start.reshape(len(start), -1)], -1)
         sims = _Worlds(packed, qpos, self)
         return hosted.follow(sims, packed, slots, poses, paths, instants, settle=settle, fence=fence)
 
@@ -167,7 +167,11 @@ class _Worlds:
         return np.zeros(0, int), np.zeros(0, int)
 
     def depths(self) -> np.ndarray:
-        """See `hosted.Worlds`; of the last step."""
+        """See `hosted.Worlds`; as of the last step, too."""
+        return self.last_depths()
+
+    def last_depths(self) -> np.ndarray:
+        """See `hosted.Worlds`; nothing sleeps."""
         deepest = np.zeros(len(self.qpos))
         count = min(int(self.data.nacon.numpy()[0]), self.data.naconmax)
         contact = self.data.contact
