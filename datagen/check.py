@@ -50,7 +50,8 @@ def run(out: pathlib.Path, plan: Plan) -> None:
     for name in plan.engines:
         kind, changes = world.ENGINES[name]
         engines[name] = make_engine(kind, **changes)
-    settings = json.loads(json.dumps(dataclasses.asdict(plan))) | {"versions": files.package_versions()}
+    code = {"versions": files.package_versions(), "code": files.code_digest(pathlib.Path(__file__).parent)}
+    settings = json.loads(json.dumps(dataclasses.asdict(plan))) | code
     files.claim(out, settings, free=("engines",))
     sections = _sections(plan, engines)
     metrics: dict[str, float | None] = {}
@@ -93,7 +94,7 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
         "sweep": lambda: world.sweep(native, reference()[0], reference()[2]),
         "camera": lambda: world.camera(keys[2], native, CAMERA_SCENES),
         **{
-            f"rest-{name}": lambda name=name, e=e: world.rests(name, e, plan.seed, 1 if name == "warp" else 6)  # type: ignore[misc]
+            f"rest-{name}": lambda name=name, e=e: world.rests(name, e, plan.seed)  # type: ignore[misc]
             for name, e in {"native": native, **engines}.items()
         },
         **{f"agreement-{name}": lambda name=name, e=e: agree(name, e) for name, e in engines.items()},  # type: ignore[misc]
@@ -145,7 +146,8 @@ def _drop_parts(cells: _Cells) -> list[str]:
             cells.number(f"rest/{name}/tries", ".0f"),
             cells.share(f"rest/{name}/at_rest"),
             cells.share(f"rest/{name}/as_put"),
-            cells.number(f"rest/{name}/from_table_max_mm", ".3f") + " mm",
+            cells.number(f"rest/{name}/turn_max_deg", ".2f"),
+            cells.number(f"rest/{name}/from_table_max_mm", ".3f"),
         ]
         for name in ("native", *world.ENGINES)
         if f"rest/{name}/tries" in cells.metrics
@@ -153,8 +155,8 @@ def _drop_parts(cells: _Cells) -> list[str]:
     return [
         "## Drops",
         _table(["objects", *columns], drops),
-        "## Every catalogue item set down on a side of its bounding box",
-        _table(["engine", "tries", "at rest", "as put", "lowest corner from the table, at most"], rests),
+        "## Every catalogue item set down on every face that it can stand on",
+        _table(["engine", "tries", "at rest", "as put", "largest turn, degrees", "farthest from the table, mm"], rests),
     ]
 
 

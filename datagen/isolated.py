@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.spatial
 
 from dipn_jax import candidates, geometry, primitives, scenes, shapes, structs
 from dipn_jax.physics import Engine
@@ -24,6 +25,8 @@ ORIENTATIONS = np.array(
      [0.5**0.5, 0, 0.5**0.5, 0], [0.5**0.5, 0, -(0.5**0.5), 0]]
 )  # fmt: skip
 """Every side of the bounding box once at the bottom, `[6, 4]` wxyz."""
+STANDS = 1e-3
+"""Metres that the centre of mass is inside the outline of a face that an object can stand on."""
 
 
 def alone(rng: np.random.Generator, item: shapes.Item, count: int) -> tuple[Scene, np.ndarray]:
@@ -32,18 +35,69 @@ def alone(rng: np.random.Generator, item: shapes.Item, count: int) -> tuple[Scen
     Returns:
       Scenes and poses `[count, 1, 7]`.
     """
+    scene = _items(rng, item, count)
+    return scene, _set_down(rng, scene, ORIENTATIONS[np.arange(count) % len(ORIENTATIONS)])
+
+
+def standing(rng: np.random.Generator, item: shapes.Item) -> tuple[Scene, np.ndarray]:
+    """One object of random size, mass and friction, once on every face that it can stand on, just above the table.
+
+    Returns:
+      Scenes `[F, 1]` and poses `[F, 1, 7]`.
+    """
+    one = _items(rng, item, 1)
+    faces = stable_faces(int(one.shape[0, 0]), one.size[0, 0])
+    scene = structs.take(one, np.zeros(len(faces), int))
+    return scene, _set_down(rng, scene, faces)
+
+
+def _items(rng: np.random.Generator, item: shapes.Item, count: int) -> Scene:
     ranges = scenes.DEFAULT_RANGES
     shape = np.full((count, 1), shapes.CLASSES.index(item.shape), np.int32)
     size = np.array(item.size_mm) / 1000 * rng.uniform(*ranges.scale, (count, 1, 3))
     size = np.maximum(size, scenes.MIN_SIDE)
     mass = rng.uniform(*ranges.density, (count, 1)) * shapes.volume(shape, size)
     friction = rng.uniform(*ranges.friction, (count, 1))
-    yaw = np.asarray(geometry.quat_about_z(rng.uniform(-np.pi, np.pi, count)))
-    quat = np.asarray(geometry.quat_multiply(yaw, ORIENTATIONS[np.arange(count) % len(ORIENTATIONS)]))
-    poses = np.concatenate([np.zeros((count, 3)), quat], -1)[:, None]
-    poses[..., 2] = 0.002 - shapes.lowest_corner(shape, size, poses, xp=np)
-    scene = Scene(shape, size, np.full((count, 1, 3), 0.5), mass, friction)
-    return structs.cast(scene), poses.astype(np.float32)
+    return structs.cast(Scene(shape, size, np.full((count, 1, 3), 0.5), mass, friction))
+
+
+def _set_down(rng: np.random.Generator, scene: Scene, quat: np.ndarray) -> np.ndarray:
+    """Poses `[B, 1, 7]` 2 mm above the table, turned by `quat [B, 4]` and then about the vertical at random."""
+    yaw = np.asarray(geometry.quat_about_z(rng.uniform(-np.pi, np.pi, len(quat))))
+    turned = np.asarray(geometry.quat_multiply(yaw, quat))
+    poses = np.concatenate([np.zeros((len(quat), 3)), turned], -1)[:, None]
+    poses[..., 2] = 0.002 - shapes.lowest_corner(scene.shape, scene.size, poses, xp=np)
+    return poses.astype(np.float32)
+
+
+def stable_faces(shape: int, size: np.ndarray) -> np.ndarray:
+    """Orientations `[F, 4]` (wxyz) that lay each face of an object's convex hull on the table that it can stand on.
+
+    Args:
+      shape: index into `shapes.CLASSES`.
+      size: `[3]` metres.
+
+    Returns:
+      Those of the faces in whose outline the centre of mass is, by at least STANDS.
+    """
+    corners = (shapes.UNIT_VERTICES[shape][shapes.CORNERS_USED[shape] > 0] * size).reshape(-1, 3)
+    planes = scipy.spatial.ConvexHull(corners, qhull_options="Qt").equations  # n @ x + d <= 0 inside
+    found = []
+    for normal in np.unique(planes[:, :3].round(4), axis=0):
+        normal = normal / np.linalg.norm(normal)
+        height = corners @ normal
+        across = np.linalg.svd(normal[None])[2][1:]  # two axes in the plane; the centre of mass is their origin
+        outline = scipy.spatial.ConvexHull(corners[height > height.max() - 1e-5] @ across.T)
+        if outline.equations[:, 2].max() < -STANDS:
+            found.append(_turn_down(normal))
+    return np.array(found)
+
+
+def _turn_down(normal: np.ndarray) -> np.ndarray:
+    """The shortest turn `[4]` (wxyz) that makes `normal [3]` point down."""
+    down = np.array([0.0, 0.0, -1.0])
+    quat = np.array([1 + normal @ down, *np.cross(normal, down)])
+    return quat / np.linalg.norm(quat) if quat[0] > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def _corners(shape: int, size: np.ndarray, pose: np.ndarray) -> list[np.ndarray]:

@@ -31,6 +31,15 @@ def _versions() -> dict[str, str]:
     return found
 
 
+def code_digest(*folders: pathlib.Path) -> str:
+    """SHA-256 of the packages' versions, the library's sources and those in other `folders`, in hex."""
+    digest = hashlib.sha256(str(package_versions()).encode())
+    for folder in (pathlib.Path(__file__).parent, *folders):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
 def file_sha256(path: pathlib.Path) -> str:
     """SHA-256 of a file's bytes, in hex."""
     digest = hashlib.sha256()

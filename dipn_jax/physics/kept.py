@@ -13,18 +13,7 @@ from jax import export
 from dipn_jax import files
 from dipn_jax.structs import Array
 
-_SOURCES = pathlib.Path(__file__).parent.parent
-
-
-def _versions() -> str:
-    """What every trace depends on: our sources and the packages."""
-    digest = hashlib.sha256(str(files.package_versions()).encode())
-    for path in sorted(_SOURCES.rglob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-_BEGUN_WITH = _versions()
+_BEGUN_WITH = files.code_digest()
 """Read while the sources are imported: who edits them later does not change what this process traces."""
 
 

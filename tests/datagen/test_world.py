@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from datagen import check, episodes, world
-from dipn_jax import geometry
+from datagen import check, episodes, isolated, world
+from dipn_jax import geometry, shapes
 from dipn_jax.errors import UserError
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
@@ -42,6 +42,21 @@ def test_a_push_of_its_own_ends_near_the_same_centimetre_of_a_longer_one(engine:
     _, poses = world.pushes(engine, trial)
     found = world.sweep(engine, trial, poses)
     assert 0 < found["sweep/5cm/p50_mm"] < 2
+
+
+def test_every_item_stays_on_every_face_that_it_can_stand_on(engine: Any) -> None:
+    counts = {}
+    for item in shapes.CATALOGUE:
+        scene, poses = isolated.standing(np.random.default_rng(0), item)
+        counts[item.name] = len(poses)
+        for i in range(len(poses)):  # on a face, not on an edge
+            parts = isolated._corners(int(scene.shape[i, 0]), scene.size[i, 0], poses[i, 0])
+            heights = np.concatenate(parts)[:, 2]
+            assert abs(heights.min() - 0.002) < 1e-5 and (heights < heights.min() + 1e-5).sum() >= 3
+    assert [counts[name] for name in ("cube", "cylinder", "concave", "triangle")] == [6, 14, 6, 5]
+    found = world.rests("native", engine, 0)
+    assert found["rest/native/tries"] == sum(counts.values())
+    assert found["rest/native/at_rest"] == found["rest/native/as_put"] == 1 and found["rest/native/turn_max_deg"] < 1
 
 
 def test_an_unknown_engine_is_named() -> None:

@@ -130,6 +130,19 @@ def test_a_spike_of_speed_and_an_object_inside_another_are_faults(engine: Any, r
     assert [bool(f & Fault.PENETRATION) for f in at_once.fault] == [False, True, False]
 
 
+@pytest.mark.parametrize(("fence", "fault"), [(0.0, Fault.PENETRATION), (0.3, 0)])
+def test_what_was_deep_inside_another_on_the_way_is_a_fault_but_for_heaps_that_fall(
+    engine: Any, resting: Any, fence: float, fault: int
+) -> None:
+    scene, poses = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 2, 0), resting)
+    cubes = scene.replace(shape=np.zeros((2, 2), np.int32), size=np.full((2, 2, 3), 0.05, np.float32))
+    poses[..., 2:] = [0.025, 1, 0, 0, 0]
+    poses[:, 1, :2] = poses[:, 0, :2] + np.array([[0.03, 0], [0.045, 0]])
+    apart = primitives.settle(engine, cubes, poses, duration=0.3, fence=fence)
+    assert (np.abs(apart.poses[:, 0, 1, 0] - apart.poses[:, 0, 0, 0]) > 0.0495).all()
+    np.testing.assert_array_equal(apart.fault & ~Fault.UNSETTLED, [fault, 0])
+
+
 def test_what_is_inside_another_stays_a_fault_when_it_sleeps(engine: Any) -> None:
     size, flat = np.full((1, 2, 3), 0.05, np.float32), np.full((1, 2), 0.35, np.float32)
     cubes = Scene(np.zeros((1, 2), np.int32), size, size, flat / 7, flat)
