@@ -87,8 +87,16 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
         count = min(plan.few, plan.scenes) if name == "warp" else plan.scenes
         return world.agreement(name, engine, made.first(count), poses[:count], held[:count])
 
+    def crowds(name: str, engine: Engine) -> dict[str, float]:
+        return world.drops(keys[0], engine, plan.few, name=f"drop-{name}", counts=world.CROWDED)
+
+    def may_crowd(engine: Engine) -> bool:
+        """MuJoCo Warp would take hours of a CPU."""
+        return engine.name == "mjx" or (engine.name == "warp" and jax.default_backend() != "cpu")
+
     return {
         "drops": lambda: world.drops(keys[0], native, clutter.BATCH),
+        **{f"drops-{name}": lambda name=name, e=e: crowds(name, e) for name, e in engines.items() if may_crowd(e)},  # type: ignore[misc]
         "grasps": lambda: world.isolated_grasps(native, plan.seed, plan.tries),
         "pushes": lambda: reference()[1],
         "sweep": lambda: world.sweep(native, reference()[0], reference()[2]),
@@ -139,7 +147,12 @@ def page(metrics: dict[str, Any]) -> str:
 
 def _drop_parts(cells: _Cells) -> list[str]:
     columns = ["kept", "outside", "unsettled", "speed", "penetration", "capacity", "non_finite"]
-    drops = [[str(n), *(cells.share(f"drop/{n}/{c}") for c in columns)] for n in world.COUNTS]
+    drops = [
+        [name, str(n), cells.number(f"{key}/{n}/tries", ".0f"), *(cells.share(f"{key}/{n}/{c}") for c in columns)]
+        for name, key in [("native", "drop"), *((name, f"drop-{name}") for name in world.ENGINES)]
+        for n in world.COUNTS
+        if f"{key}/{n}/kept" in cells.metrics
+    ]
     rests = [
         [
             name,
@@ -154,7 +167,7 @@ def _drop_parts(cells: _Cells) -> list[str]:
     ]
     return [
         "## Drops",
-        _table(["objects", *columns], drops),
+        _table(["engine", "objects", "tries", *columns], drops),
         "## Every catalogue item set down on every face that it can stand on",
         _table(["engine", "tries", "at rest", "as put", "largest turn, degrees", "farthest from the table, mm"], rests),
     ]

@@ -94,8 +94,8 @@ def grasp(
     actions: int = 6,
     shard_size: int = 600,
     grasp_net: pathlib.Path | None = None,
-    guided: float = 0.5,
-    hard: float = 0.25,
+    guided: float | None = None,
+    hard: float | None = None,
     ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
@@ -115,14 +115,17 @@ def grasp(
       actions: different grasps tried on each settled scene.
       shard_size: episodes in a file.
       grasp_net: run of dipn-train, or builtin; none: all grasps are random.
-      guided: share of grasps that it scores high.
-      hard: share of grasps that it is unsure of.
+      guided: share of grasps that it scores high, 0.5 unless given.
+      hard: share of grasps that it is unsure of, 0.25 unless given.
       ranges: what random objects are drawn from.
       work: engine and share of the work.
     """
     job: dict[str, Any] = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions}
     if grasp_net is None:
+        if guided is not None or hard is not None:
+            raise UserError("--guided and --hard are shares of what a network believes: give --grasp-net, too")
         return _generate("grasp", out, objects, ranges, work, **job)
+    guided, hard = (value if given is None else given for given, value in ((guided, 0.5), (hard, 0.25)))
     if not (guided >= 0 and hard >= 0 and 0 < guided + hard <= 1):
         raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
     network: Any = checkpoint.load_network(grasp_net, network="grasp")
@@ -172,7 +175,7 @@ def check_world(
       out: folder for metrics.json and world.md; asking again goes on where it stopped.
       engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
       scenes_: scenes with a push and a grasp each.
-      few: as many of them for warp, which makes about 60 steps a second on a CPU.
+      few: as many of them for warp, which makes about 60 steps a second on a CPU, and drops for mjx.
       tries: grasps of every catalogue item.
       seed: seed of everything random.
     """

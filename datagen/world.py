@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,8 @@ from dipn_jax.workspace import PUSH_STEPS
 
 COUNTS = (1, 3, 7, 10, 20, 30)
 """Numbers of objects that drops are counted for."""
+CROWDED = (10, 20, 30)
+"""Numbers for which engines that keep a limited number of contacts are tried, too."""
 MOVED = 0.001
 """Metres: what the reference moves by more during a push counts in the engines' agreement."""
 GRASPS = 4
@@ -48,15 +51,16 @@ class Trial:
         return Trial(*(structs.take(x, slice(0, count)) for x in (self.items, self.pushes, self.grasps)))
 
 
-def drops(key: jax.Array, engine: Engine, tries: int) -> Metrics:
-    """`drop/{objects}/kept` and `drop/{objects}/{fault}`: shares of random drops."""
-    found = {}
-    for count in COUNTS:
+def drops(key: jax.Array, engine: Engine, tries: int, *, name: str = "drop", counts: Sequence[int] = COUNTS) -> Metrics:
+    """`{name}/{objects}/kept` and `{name}/{objects}/{fault}`: shares of random drops."""
+    found: Metrics = {}
+    for count in counts:
         kept, counted = clutter.settled(key, engine, scenes.parse_objects(str(count)), tries)
-        found[f"drop/{count}/kept"] = len(kept.fault) / tries
-        for name, n in counted.items():
-            if name != "dropped_scenes":
-                found[f"drop/{count}/{name.removeprefix('settle_')}"] = n / tries
+        found[f"{name}/{count}/tries"] = tries
+        found[f"{name}/{count}/kept"] = len(kept.fault) / tries
+        for fault, n in counted.items():
+            if fault != "dropped_scenes":
+                found[f"{name}/{count}/{fault.removeprefix('settle_')}"] = n / tries
     return found
 
 
@@ -97,7 +101,7 @@ def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
 def trial(key: jax.Array, engine: Engine, count: int) -> Trial:
     """`count` scenes of 1 to 7 objects, with a random feasible push and GRASPS random grasps of the foreground."""
     drop, aim = jax.random.split(key)
-    items = clutter.settled_exactly(drop, engine, scenes.SceneConfig(), 2 * count)
+    items = clutter.settled_exactly(drop, engine, scenes.SceneConfig(), max(2 * count, 8))
     keys = jax.random.split(aim, len(items.fault))
     pushes, feasible = episodes.aim_pushes(keys, items.scene, items.poses, actions=1)
     grasps = episodes.aim_grasps(keys, items.scene, items.poses, actions=GRASPS)

@@ -126,7 +126,8 @@ def _newton(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]
     away = p.stiffness[:, None] * reach.away
     lack = p.mass @ a - p.force
     gradient = lack + (push * x) @ p.rows + jnp.einsum("ck,ckv->v", away, p.cones)
-    bent = p.stiffness[:, None, None] * (_blocks(reach) @ p.cones)
+    blocks = (p.stiffness[:, None, None] * _blocks(reach))[..., None]
+    bent = (blocks * p.cones[:, None]).sum(2)  # of three: on a GPU as a product a fifth of a step
     flat = p.cones.reshape(-1, p.cones.shape[-1])
     hessian = p.mass + (p.rows.T * push) @ p.rows + flat.T @ bent.reshape(flat.shape)
     size = jax.lax.rsqrt(jnp.diagonal(hessian))  # masses and inertias differ by 10^5
