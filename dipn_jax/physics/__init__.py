@@ -29,8 +29,8 @@ FENCE = 0.17
 FENCE_RATE = 30.0
 """rad/s of the fence's critically damped spring (per mass): 11 mm beyond it, the push is an object's weight."""
 
-ENOUGH_CORES = 6
-"""Cores with which `native` is as fast as `mjx` on a large GPU (docs/benchmarks.md: an H200 does the work of 5.2)."""
+ENOUGH_CORES = 8
+"""Cores with which `native` is as fast as `mjx` on a large GPU (docs/benchmarks.md: an H200 does the work of 8.4)."""
 
 
 def fence_force(mass: Array, position: Array, velocity: Array, *, xp: ModuleType = jnp) -> Array:
