@@ -27,7 +27,7 @@ MAX_ATTEMPTS = 100
 MAX_ACTIONS = 256
 """Actions tried on one scene."""
 AT_ONCE = 2
-"""Shards in the making: the engine steps one of them at a time."""
+"""Shards in the making: what one leaves idle of the processor, the other takes."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -121,25 +121,26 @@ def inertias(scene: Scene) -> np.ndarray:
 def _fillers(scene: Scene) -> str:
     """Meshes that no geom uses: with them the bounding volumes of all meshes have as many nodes in every scene.
 
-    A hull of f triangles has 2 f - 1 nodes: of a prism of n sides, with f = 4 n - 4, and of v corners in general
-    position, with f = 2 v - 4, which makes 4 v - 9.
+    f triangles have 2 f - 1 nodes: a prism of n sides, with f = 4 n - 4, and a double pyramid, with f = 2 n.
     """
     shape = np.asarray(scene.shape)
     sides = shapes.CORNERS_USED[np.maximum(shape, 0)]
     meshes = (sides > 0) & ((shape >= 0) & (shape != shapes.CLASSES.index("cuboid")))[:, None]
     most = len(shape) * (8 * shapes.CORNERS - 9)  # no object has more
-    missing = most + 28 - int((8 * sides - 9)[meshes].sum())  # from 28 on, any number can be made up
+    missing = most + 44 - int((8 * sides - 9)[meshes].sum())  # from 44 on, any number can be made up
     count = -missing % 4 or 4
-    corners = [4] * (count - 1) + [(missing + 9 * count) // 4 - 4 * (count - 1)]
-    return "".join(f'<mesh name="filler{i}" vertex="{_text(_ball(n))}"/>' for i, n in enumerate(corners))
+    pyramids = [3] * (count - 1) + [(missing + count) // 4 - 3 * (count - 1)]
+    return "".join(_double_pyramid(f"filler{i}", n) for i, n in enumerate(pyramids))
 
 
-def _ball(count: int) -> np.ndarray:
-    """`count` corners `[V, 3]` on a sphere: a Fibonacci lattice, so that each is one of the hull's."""
-    at = np.arange(count) + 0.5
-    height, angle = 1 - 2 * at / count, np.pi * (1 + np.sqrt(5)) * at
-    ring = np.sqrt(1 - height**2)
-    return 0.05 * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], -1)
+def _double_pyramid(name: str, sides: int) -> str:
+    """A mesh of given faces: without any, MuJoCo would look for a hull."""
+    angle, at = 2 * np.pi * np.arange(sides) / sides, np.arange(sides)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], -1)
+    corners = np.round(0.05 * np.concatenate([ring, [[0, 0, 1], [0, 0, -1]]]), 5)  # short to write
+    upper = np.stack([at, (at + 1) % sides, np.full(sides, sides)], -1)
+    faces = " ".join(map(str, np.concatenate([upper, upper[:, ::-1] + np.array([1, 0, 0])]).ravel()))
+    return f'<mesh name="{name}" inertia="shell" vertex="{_text(corners)}" face="{faces}"/>'
 
 
 def _mesh(name: str, shape: int, part: int, size: np.ndarray) -> str:
@@ -178,8 +179,7 @@ def mjcf(
             alive = scene.shape[i] >= 0 and shapes.CORNERS_USED[int(scene.shape[i]), part] > 0
             gap = "" if generic or alive else ' margin="-1000"'
             floor.append(
-                f'<pair geom1="floor" geom2="o{i}p{part}" condim="3" friction="{mu:.9g} {mu:.9g} 0.005 0.0001 0.0001"'
-                f' solref="{config.solref}" solimp="{config.solimp}"{gap}/>'
+                f'<pair geom1="floor" geom2="o{i}p{part}" friction="{mu:.9g} {mu:.9g} 0.005 0.0001 0.0001"{gap}/>'
             )
     extra = _fillers(scene) if alike else ""
     if generic:
@@ -195,7 +195,7 @@ def mjcf(
  sleep_tolerance="{c.sleep}"> <flag multiccd="enable" autoreset="disable"{sleep}/></option>
 <custom><numeric name="max_geom_pairs" data="{pairs}"/>
  <numeric name="max_contact_points" data="{contacts}"/></custom>
-<default><geom solref="{c.solref}" solimp="{c.solimp}"/>
+<default><geom solref="{c.solref}" solimp="{c.solimp}"/><pair condim="3" solref="{c.solref}" solimp="{c.solimp}"/>
  <default class="object"><geom contype="1" conaffinity="3" condim="3"/></default>
  <default class="link">
   <geom contype="2" conaffinity="0" condim="3" priority="1" friction="0.35 0.005 0.0001"/></default>

@@ -70,7 +70,10 @@ def substeps(config: PhysicsConfig) -> int:
 
 
 class Engine(Protocol):
-    """Simulates batches of independent scenes. Threads may share one: it steps one batch at a time."""
+    """Simulates batches of independent scenes.
+
+    Threads may share one: `native` steps their batches side by side, the others one by one.
+    """
 
     name: str
     config: PhysicsConfig

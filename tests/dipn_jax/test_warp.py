@@ -8,7 +8,9 @@ import pytest
 
 from dipn_jax import physics, primitives, structs
 from dipn_jax.errors import UserError
+from dipn_jax.physics import warp
 from dipn_jax.structs import Fault
+from dipn_jax.workspace import WORKSPACE
 
 
 def test_without_its_packages_it_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,11 +20,46 @@ def test_without_its_packages_it_is_refused_in_one_line(monkeypatch: pytest.Monk
     assert "\n" not in str(error.value)
 
 
-def test_it_follows_the_native_engine(engine: Any, settled: Any) -> None:
+@pytest.fixture(scope="module")
+def warp_engine() -> Any:
     pytest.importorskip("warp")
+    return physics.make_engine("warp")
+
+
+def test_it_follows_the_native_engine(warp_engine: Any, engine: Any, settled: Any) -> None:
     scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2].copy()
     poses[:, :, 2] += 0.01
-    found = primitives.settle(physics.make_engine("warp"), scene, poses, duration=0.06)
+    found = primitives.settle(warp_engine, scene, poses, duration=0.06)
     wanted = primitives.settle(engine, scene, poses, duration=0.06)
     np.testing.assert_allclose(found.poses[..., :3], wanted.poses[..., :3], atol=1e-4)
     np.testing.assert_array_equal(found.fault & ~Fault.UNSETTLED, wanted.fault & ~Fault.UNSETTLED)
+
+
+def test_what_is_not_finite_or_outside_is_a_fault_of_its_own_episode(warp_engine: Any, settled: Any) -> None:
+    scene, poses = structs.take(settled.scene, np.array([0, 1, 1])), settled.poses[[0, 1, 1]].copy()
+    poses[0, 0, 2] = np.nan
+    poses[1, 1, 0] = WORKSPACE.half + 0.01
+    fault = primitives.settle(warp_engine, scene, poses, duration=0.02).fault
+    assert fault[0] & Fault.NON_FINITE
+    assert fault[1] & ~Fault.UNSETTLED == Fault.OUTSIDE
+    assert fault[2] & ~Fault.UNSETTLED == 0
+
+
+def test_lack_of_room_for_contacts_is_a_fault(warp_engine: Any, settled: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2]
+    for limits in (("CONTACTS", "PAIRS"), ("ROWS",)):
+        with monkeypatch.context() as patch:
+            for limit in limits:
+                patch.setattr(warp, limit, 1)
+            fault = primitives.settle(warp_engine, scene, poses, duration=0.01).fault
+        assert (fault & Fault.CAPACITY).any()
+
+
+def test_an_object_inside_another_is_a_fault(warp_engine: Any, settled: Any) -> None:
+    scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2].copy()
+    cubes = scene.replace(shape=np.zeros_like(scene.shape), size=np.full_like(scene.size, 0.05))
+    poses[..., 2:] = [0.025, 1, 0, 0, 0]
+    poses[..., :2] = np.array([[-0.15, 0], [-0.08, 0], [0, 0], [0.07, 0], [0.15, 0]])
+    poses[1, 1, :2] = [-0.12, 0]
+    fault = primitives.settle(warp_engine, cubes, poses, duration=0.01).fault
+    assert [bool(f & Fault.PENETRATION) for f in fault] == [False, True]
