@@ -72,7 +72,7 @@ def follow(
             if fence:
                 hold_in(sims, mass, up=times[tick] < fence)
             watch.raised(*sims.advance())
-            watch.tick(now[tick + 1], fenced=times[tick] < fence)
+            watch.tick(now[tick + 1], deep=times[tick] >= max(fence, faults.GRACE))
     fault = watch.codes(now[last], settle)
     rollout, hand = (np.stack(part, 1).astype(np.float32) for part in zip(*stored, strict=True))
     return Rollout(rollout, hand, fault)
@@ -87,7 +87,7 @@ class Watch:
         self.broken, self.full = np.zeros((2, batch), bool)
         self.fastest = np.zeros((batch, slots))  # (m/s)^2: highest so far
         self.off = np.zeros((batch, 3))  # metres: farthest that the hand was off its path
-        self.deepest = np.zeros(batch)  # metres: contact, without a fence
+        self.deepest = np.zeros(batch)  # metres: contact, where depth counts
 
     def raised(self, failed: np.ndarray, full: np.ndarray) -> None:
         """Note simulations that the engine gave up."""
@@ -97,12 +97,12 @@ class Watch:
         """Of the objects `[B, N, 6]`."""
         return np.asarray(self.sims.qvel)[:, GRIPPER_DOF:].reshape(*self.scenes.shape.shape, 6)
 
-    def tick(self, target: np.ndarray, *, fenced: bool) -> None:
-        """Note speeds, depths (unless `fenced`), and how far the hand is off its `target [B, 6]`."""
+    def tick(self, target: np.ndarray, *, deep: bool) -> None:
+        """Note speeds, depths (if `deep`), and how far the hand is off its `target [B, 6]`."""
         linear = self.velocity()[..., :3]
         np.maximum(self.fastest, np.einsum("bnk,bnk->bn", linear, linear), out=self.fastest)
         np.maximum(self.off, np.abs(np.asarray(self.sims.qpos)[:, :3] - target[:, :3]), out=self.off)
-        if not fenced:
+        if deep:
             np.fmax(self.deepest, self.sims.last_depths(), out=self.deepest)
 
     def codes(self, target: np.ndarray, settle: bool) -> np.ndarray:

@@ -214,11 +214,11 @@ class _Program:
             state, record = carry
             record = recording.store(record, state, ticks == tick)
             ctrl = target(tick * physics.CONTROL_PERIOD + GRIPPER.lag)
-            fenced = tick * physics.CONTROL_PERIOD < fence
-            force = jnp.where(fenced, recording.hold_in(mass, state), 0.0)
+            time = tick * physics.CONTROL_PERIOD
+            force = jnp.where(time < fence, recording.hold_in(mass, state), 0.0)
             state = jax.vmap(self._tick)(fields, state, ctrl, force)
             due = target((tick + 1) * physics.CONTROL_PERIOD)
-            return state, recording.watch(record, state, scenes, due, fenced=fenced)
+            return state, recording.watch(record, state, scenes, due, deep=time >= jnp.maximum(fence, faults.GRACE))
 
         last = ticks.max()
         state, record = jax.lax.fori_loop(0, last, body, (state, record))

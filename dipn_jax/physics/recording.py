@@ -32,7 +32,7 @@ class Record(Pytree):
     top: Array  # [] m/s: highest speed of a present object
     stray: Array  # [] metres: farthest that the hand was off its path
     broken: Array  # [] bool
-    deepest: Array  # [] metres: contact, without a fence
+    deepest: Array  # [] metres: contact, where depth counts
 
 
 def hold_in(mass: jax.Array, state: State) -> jax.Array:
@@ -72,12 +72,12 @@ def velocity(state: State, scenes: Scene) -> jax.Array:
     return state.qvel[:, GRIPPER_DOF:].reshape(*scenes.shape.shape, 6)
 
 
-def watch(record: Record, state: State, scenes: Scene, target: jax.Array, *, fenced: jax.Array) -> Record:
-    """Note speeds, depths (unless `fenced []`), what is not finite, and how far the hand is off its `target [B, 6]`."""
+def watch(record: Record, state: State, scenes: Scene, target: jax.Array, *, deep: jax.Array) -> Record:
+    """Note speeds, depths (if `deep []`), what is not finite, and how far the hand is off its `target [B, 6]`."""
     linear = faults.speed(scenes, velocity(state, scenes))
     finite = jnp.isfinite(state.qpos).all(-1) & jnp.isfinite(state.qvel).all(-1)
     top = jnp.maximum(record.top, jnp.where(finite, linear.max(-1), 0.0))
     off = faults.off_path(state.qpos[:, :3], target[:, :3])
     stray = jnp.maximum(record.stray, jnp.where(finite, off, jnp.inf))
-    deepest = jnp.maximum(record.deepest, jnp.where(finite & ~fenced, state.depth, 0.0))
+    deepest = jnp.maximum(record.deepest, jnp.where(finite & deep, state.depth, 0.0))
     return record.replace(top=top, stray=stray, broken=record.broken | ~finite, deepest=deepest)

@@ -130,17 +130,17 @@ def test_a_spike_of_speed_and_an_object_inside_another_are_faults(engine: Any, r
     assert [bool(f & Fault.PENETRATION) for f in at_once.fault] == [False, True, False]
 
 
-@pytest.mark.parametrize(("fence", "fault"), [(0.0, Fault.PENETRATION), (0.3, 0)])
-def test_what_was_deep_inside_another_on_the_way_is_a_fault_but_for_heaps_that_fall(
+@pytest.mark.parametrize(("fence", "fault"), [(0.0, Fault.PENETRATION), (0.6, 0)])
+def test_a_contact_that_was_deep_on_the_way_is_a_fault_but_for_heaps_that_fall_and_at_the_start(
     engine: Any, resting: Any, fence: float, fault: int
 ) -> None:
-    scene, poses = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 2, 0), resting)
-    cubes = scene.replace(shape=np.zeros((2, 2), np.int32), size=np.full((2, 2, 3), 0.05, np.float32))
+    scene, poses = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 3, 0), resting)
+    cubes = scene.replace(shape=np.zeros((3, 2), np.int32), size=np.full((3, 2, 3), 0.05, np.float32))
     poses[..., 2:] = [0.025, 1, 0, 0, 0]
-    poses[:, 1, :2] = poses[:, 0, :2] + np.array([[0.03, 0], [0.045, 0]])
-    apart = primitives.settle(engine, cubes, poses, duration=0.3, fence=fence)
-    assert (np.abs(apart.poses[:, 0, 1, 0] - apart.poses[:, 0, 0, 0]) > 0.0495).all()
-    np.testing.assert_array_equal(apart.fault & ~Fault.UNSETTLED, [fault, 0])
+    poses[:, 1, :3] = poses[:, 0, :3] + np.array([[0.1, 0, 1.1], [0.1, 0, 0.1], [0.03, 0, 0]])  # ends at 4.6 m/s
+    found = primitives.settle(engine, cubes, poses, duration=0.6, fence=fence)
+    np.testing.assert_array_equal(found.fault & ~Fault.UNSETTLED, [fault, 0, 0])
+    assert np.abs(found.poses[2, 0, 1, 0] - found.poses[2, 0, 0, 0]) > 0.0495  # pushed apart
 
 
 def test_what_is_inside_another_stays_a_fault_when_it_sleeps(engine: Any) -> None:
