@@ -26,7 +26,7 @@ class Plan:
 
     engines: tuple[str, ...]
     scenes: int
-    few: int  # scenes for warp, which is slow on a CPU
+    few: int  # scenes for warp, which is slow on a CPU, and drops for mjx (on a GPU for warp, too)
     tries: int
     seed: int
 

@@ -124,8 +124,8 @@ def shard(
 def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1, scorer: Scorer | None = None) -> None:
     """Write the shards of `job` that are missing; `part` of `of` workers takes every `of`-th.
 
-    Two shards are in the making at any time: while the engine steps one, the scenes of the other are drawn, built,
-    looked at, sifted, encoded or written.
+    Two shards are in the making at any time: while one is stepped, the scenes of the other are stepped, too, or drawn,
+    built, looked at, sifted, encoded or written.
 
     Args:
       job: what the data set is a function of.

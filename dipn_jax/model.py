@@ -185,7 +185,7 @@ def mjcf(
     if generic:
         extra = _mesh("part", shapes.CLASSES.index("cylinder"), 0, np.full(3, 0.05))
     nearest = "" if generic else '<sensor><contact name="nearest" data="dist" reduce="mindist" num="1"/></sensor>'
-    jacobian = "dense" if generic else "auto"  # sparse from ten objects on: 30 fall in 0.7 of the time
+    jacobian = "dense" if generic else "auto"  # sparse from nine objects on: 30 fall in 0.7 of the time
     pairs, contacts = config.caps(n)
     c, sleep = config, ' sleep="enable"' if config.sleep else ""
     return f"""<mujoco model="dipn">

@@ -31,7 +31,7 @@ class Fault:
     UNSETTLED = 4  # something still moved when it had to be at rest
     OUTSIDE = 8  # an object's centre is outside the workspace
     SPEED = 16  # an object moved faster than anything dropped or pushed should
-    PENETRATION = 32  # an object is in the table, or in another, or was so deep on the way that it passed through
+    PENETRATION = 32  # an object is in the table, or in another, or was deep in one on the way
     SHORT = 64  # the gripper did not reach its commanded pose, or left its path on the way
     TIPPED = 128  # a push tipped an object over
 

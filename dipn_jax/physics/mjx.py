@@ -210,15 +210,17 @@ class _Program:
         none = jnp.zeros(len(poses))
         record = Record(*room, top=none, stray=none, broken=none > 0, deepest=none)
 
+        # in whole ticks: in float32 ten periods are less than a tenth of a second
+        fenced, grace = jnp.round(fence / physics.CONTROL_PERIOD), round(faults.GRACE / physics.CONTROL_PERIOD)
+
         def body(tick: jax.Array, carry: tuple[State, Record]) -> tuple[State, Record]:
             state, record = carry
             record = recording.store(record, state, ticks == tick)
             ctrl = target(tick * physics.CONTROL_PERIOD + GRIPPER.lag)
-            time = tick * physics.CONTROL_PERIOD
-            force = jnp.where(time < fence, recording.hold_in(mass, state), 0.0)
+            force = jnp.where(tick < fenced, recording.hold_in(mass, state), 0.0)
             state = jax.vmap(self._tick)(fields, state, ctrl, force)
             due = target((tick + 1) * physics.CONTROL_PERIOD)
-            return state, recording.watch(record, state, scenes, due, deep=time >= jnp.maximum(fence, faults.GRACE))
+            return state, recording.watch(record, state, scenes, due, deep=tick >= jnp.maximum(fenced, grace))
 
         last = ticks.max()
         state, record = jax.lax.fori_loop(0, last, body, (state, record))
