@@ -111,8 +111,10 @@ def trial(key: jax.Array, engine: Engine, count: int) -> Trial:
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle `[...]` (radians) between orientations `[..., 4]`."""
-    return 2 * np.arccos(np.clip(np.abs((a * b).sum(-1)), 0.0, 1.0))
+    """Angle `[...]` (radians) between orientations `[..., 4]`; by the chord, as a cosine near one has no digits."""
+    a, b = (q / np.linalg.norm(q, axis=-1, keepdims=True) for q in (np.asarray(a, float), np.asarray(b, float)))
+    chord = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    return 4 * np.arcsin(np.clip(chord / 2, 0.0, 1.0))
 
 
 def pushes(engine: Engine, made: Trial) -> tuple[Metrics, np.ndarray]:
