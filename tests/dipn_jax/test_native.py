@@ -269,3 +269,14 @@ def test_auto_is_what_is_faster_there(monkeypatch: pytest.MonkeyPatch, device: s
     monkeypatch.setattr(jax, "default_backend", lambda: device)
     monkeypatch.setattr(physics, "cores", lambda: cores)
     assert physics.resolve("auto") == engine and physics.resolve("warp") == "warp"
+
+
+@pytest.mark.parametrize("slots", [1, 3, 9])
+def test_models_of_any_mix_share_one_layout(slots: int, rng: np.random.Generator) -> None:
+    nodes = set()
+    for shape in [*np.tile(np.arange(-1, 5)[:, None], slots), *rng.integers(-1, 5, (8, slots))]:
+        ones = np.full(slots, 0.1, np.float32)
+        scene = Scene(shape, np.full((slots, 3), 0.05), np.zeros((slots, 3)), ones, ones)
+        text = model.mjcf(scene, config=native.DEFAULTS, alike=True)
+        nodes.add(mujoco.MjModel.from_xml_string(text).nbvh)
+    assert len(nodes) == 1
