@@ -17,9 +17,9 @@ REST_SPEED = 0.02
 MAX_SINK = 0.004
 """Metres that the lowest corner of an object may be under the table, or an object inside another."""
 MAX_DEPTH = 0.01
-"""Metres that a contact may be deep on the way, unless a fence is up: heaps that fall are pressed together by their
-impacts (30 objects: 14 mm at half of the drops) and part again. Measured, 1 to 30 objects: pushes at most 3.6 mm, 99 %
-of grasps at most 5 mm, the worst (a finger on an object that cannot give way) 19 mm.
+"""Metres that a contact may be deep on the way, looked at once a control period, unless a fence is up: heaps that fall
+are pressed together by their impacts (30 objects: 14 mm at half of the drops) and part again. Measured on 1 to 30
+objects: pushes at most 3.6 mm, 99 % of grasps at most 5 mm, the worst, with the hand held up by a finger, 22 mm.
 """
 GRACE = 0.1
 """Seconds from the start in which it may be deeper: what is set down inside something is pushed out (one of the hard
