@@ -175,7 +175,7 @@ def check_world(
       out: folder for metrics.json and world.md; asking again goes on where it stopped.
       engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
       scenes_: scenes with a push and a grasp each.
-      few: as many of them for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, warp too).
+      few: as many of them for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, warp).
       tries: grasps of every catalogue item.
       seed: seed of everything random.
     """
