@@ -16,6 +16,7 @@ import shutil
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
@@ -125,23 +126,50 @@ def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
 
 
 def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
-    """One part of a step, in the structure of `target`.
+    """One part of a step, in the structure of `target`, on this process's default device.
+
+    Orbax would put arrays back on the devices that saved them, which another machine does not have; so they are read
+    as NumPy arrays.
 
     Raises:
       UserError: the stored arrays have other names or shapes.
     """
-    stored = ocp.StandardCheckpointer().restore((folder / name).resolve())
+    stored = _numpy_arrays((folder / name).resolve())
     wanted = _flat(target)
     different = sorted(set(stored) ^ set(wanted)) + [
-        key for key in wanted if key in stored and np.shape(stored[key]) != np.shape(wanted[key])
+        key for key in wanted if key in stored and stored[key].shape != _stored_shape(wanted[key])
     ]
     if different:
         raise UserError(
             f"checkpoint {folder}: made for another architecture ({len(different)} arrays differ, first "
             f"{different[0]}); train again, or give the run it belongs to"
         )
-    leaves = [stored[key] for key in wanted]
+    leaves = [_on_device(stored[key], like=leaf) for key, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(target), leaves)
+
+
+def _is_key(leaf: Any) -> bool:
+    """Whether a leaf is a random key (dropout's), which is stored as its numbers."""
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _stored_shape(leaf: Any) -> tuple[int, ...]:
+    return np.shape(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _on_device(stored: np.ndarray, *, like: Any) -> jax.Array:
+    """A copy of `stored` on the default device (training donates its buffers); a random key where `like` is one."""
+    array = jnp.array(stored)
+    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if _is_key(like) else array
+
+
+def _numpy_arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
+    """The arrays of one Orbax folder by their path in the tree, whatever devices saved them."""
+    checkpointer = ocp.PyTreeCheckpointer()
+    stored = checkpointer.metadata(part).item_metadata.tree
+    as_numpy = {key: ocp.RestoreArgs(restore_type=np.ndarray) for key in stored}
+    restored: dict[str, np.ndarray] = checkpointer.restore(part, restore_args=as_numpy)
+    return restored
 
 
 def digest(model: nnx.Module) -> str:

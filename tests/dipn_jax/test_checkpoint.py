@@ -2,15 +2,17 @@ import json
 import pathlib
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint
+from dipn_jax import checkpoint, files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
 
 CONFIG = GraspConfig(width=8)
+BUILTIN = pathlib.Path("builtin")
 
 
 def _save(run: pathlib.Path, step: int, seed: int = 0) -> nnx.Module:
@@ -29,6 +31,63 @@ def test_what_is_loaded_is_what_was_saved(tmp_path: pathlib.Path) -> None:
     assert loaded.config == CONFIG
     for a, b in zip(_leaves(model), _leaves(loaded), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def _moved_to(run: pathlib.Path, device: str) -> None:
+    """Rewrite the checkpoints of a run as if `device` had saved them."""
+    for sharding in run.rglob("_sharding"):
+        here = str(jax.local_devices()[0])
+        assert here in sharding.read_text()
+        sharding.write_text(sharding.read_text().replace(here, device))
+        step = next(folder for folder in sharding.parents if (folder / "meta.json").exists())
+        meta = json.loads((step / "meta.json").read_text())
+        meta["sha256"][str(sharding.relative_to(step))] = files.file_sha256(sharding)
+        (step / "meta.json").write_text(json.dumps(meta))
+
+
+@pytest.mark.parametrize("device", ["cuda:0", "TPU_0(process=0,(0,0,0,0))", "TFRT_CPU_7"])
+def test_weights_load_on_another_device_than_saved_them(tmp_path: pathlib.Path, device: str) -> None:
+    model = _save(tmp_path, 10, seed=3)
+    _moved_to(tmp_path, device)
+    loaded = checkpoint.load_network(tmp_path, network="grasp")
+    for a, b in zip(_leaves(model), _leaves(loaded), strict=True):
+        np.testing.assert_array_equal(a, b)
+    on = {leaf.device for leaf in jax.tree.leaves(nnx.state(loaded))}
+    assert on == {jax.devices()[0]}, "arrays of this process's device, not of the host"
+
+
+def test_random_keys_come_back_as_keys_on_another_device(tmp_path: pathlib.Path) -> None:
+    """The published GN keeps its dropout's key beside its weights."""
+    state = {"key": jax.random.key(3), "count": jnp.int32(7)}
+    parts = {"model": nnx.state(checkpoint.build("grasp", CONFIG)), "train": state}
+    checkpoint.save(tmp_path, 1, parts, network="grasp", config=CONFIG, extra={})
+    _moved_to(tmp_path, "cuda:0")
+    folder, _ = checkpoint.newest(tmp_path)  # type: ignore[misc]
+    fresh = {"key": jax.random.key(0), "count": jnp.int32(0)}
+    restored = checkpoint.restore(folder, "train", fresh)
+    assert restored["key"].dtype == state["key"].dtype and int(restored["count"]) == 7
+    assert jax.random.uniform(restored["key"]) == jax.random.uniform(state["key"])
+
+
+@pytest.mark.parametrize("network", ["dipn", "grasp"])
+def test_the_shipped_weights_load_where_no_device_has_the_name_of_the_one_that_saved_them(
+    network: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Imitates a GPU host: Orbax looks for the saved device's name among these."""
+
+    class Device:
+        def __init__(self, real: jax.Device) -> None:
+            self.real = real
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.real, name)
+
+        def __str__(self) -> str:
+            return "cuda:0"
+
+    devices = [Device(device) for device in jax.local_devices()]
+    monkeypatch.setattr(jax, "local_devices", lambda *_, **__: devices)
+    assert all(np.isfinite(leaf).all() for leaf in _leaves(checkpoint.load_network(BUILTIN, network=network)))
 
 
 @pytest.mark.parametrize("damage", ["flip", "empty", "no meta"])
