@@ -67,7 +67,7 @@ BENCHMARKS = {
     "decide.fast_path": Benchmark(
         "share of scenes on which the fast path decides as the plain one", ">= 0.99", "deciding:fast_path"
     ),
-    "decide.lockstep": Benchmark("episodes a minute in lockstep over one by one", "none", "deciding:lockstep"),
+    "decide.lockstep": Benchmark("episodes a minute in lockstep over one by one", "none", "deciding:in_lockstep"),
     "engines.scene_seconds": Benchmark(
         "seconds of heaps of seven objects simulated a second, by each engine", "none", "rates:scene_seconds"
     ),

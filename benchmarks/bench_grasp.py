@@ -13,9 +13,10 @@ import numpy as np
 
 from benchmarks.harness import Setting, Skipped, alternate
 from benchmarks.worker import Worker, versus
-from dipn_jax import clutter, render, scenes
 from dipn_jax.networks.grasp import VIEW
 from dipn_jax.physics import make_engine
+from dipn_jax.sight import render
+from dipn_jax.world import clutter, scenes
 
 BATCHES = {"compact": (32, 112), "paper": (2, VIEW)}
 """Examples a training step, and pixels a side of each."""
@@ -30,7 +31,7 @@ def _need_torch() -> None:
 def _image(seed: int) -> np.ndarray:
     """What the camera sees of a scene of ten objects `[224, 224, 4]`."""
     items = clutter.settled_exactly(jax.random.key(seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
-    seen = jax.tree.map(lambda leaf: leaf[0], clutter.observe(items.scene, items.poses))
+    seen = jax.tree.map(lambda leaf: leaf[0], render.observe(items.scene, items.poses))
     return np.asarray(render.rgbd(seen))
 
 

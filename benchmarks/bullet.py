@@ -12,15 +12,16 @@ from multiprocessing.pool import Pool
 import jax
 import mujoco
 import numpy as np
+from dipn_jax.datagen.generate import Job
 
 from benchmarks import bullet_worker
 from benchmarks.bullet_worker import CONTROL_PERIOD, Settings, Work
 from benchmarks.harness import Setting, Skipped, alternate, make_data
-from datagen.generate import Job
-from dipn_jax import model, primitives, scenes, shapes, structs
+from dipn_jax import structs
 from dipn_jax.physics import cores, native
 from dipn_jax.structs import Push, Scene
 from dipn_jax.workspace import GRIPPER
+from dipn_jax.world import model, primitives, scenes, shapes
 
 OBJECTS = 7
 ITEMS = tuple(item.name for item in shapes.CATALOGUE if item.shape != "concave")

@@ -11,6 +11,8 @@ import time
 from collections.abc import Iterator
 
 from benchmarks.harness import Setting
+from dipn_jax import batching
+from dipn_jax.sight import render
 
 OBJECTS, BATCH = 7, 4
 
@@ -20,18 +22,20 @@ def first_calls() -> float:
     import jax
     import numpy as np
 
-    from dipn_jax import candidates, clutter, console, primitives, scenes
+    from dipn_jax import console
     from dipn_jax.physics import make_engine
+    from dipn_jax.planning import candidates
+    from dipn_jax.world import primitives, scenes
 
     console.enable_compilation_cache()
     engine = make_engine("mjx")
     jax.block_until_ready(jax.numpy.zeros(1) + 1)  # the device is up
     begun = time.perf_counter()
     draw = jax.jit(jax.vmap(lambda key: scenes.random_scene(key, config=scenes.fixed_count(OBJECTS))))
-    scene, poses = draw(jax.random.split(jax.random.key(0), clutter.BATCH))
-    seen = clutter.observe(scene, poses)
+    scene, poses = draw(jax.random.split(jax.random.key(0), batching.BATCH))
+    seen = render.observe(scene, poses)
     aim = jax.jit(jax.vmap(lambda key, one: candidates.sample_pushes(key, one, count=3, slots=OBJECTS, distance=0.1)))
-    jax.block_until_ready(aim(jax.random.split(jax.random.key(1), clutter.BATCH), seen))
+    jax.block_until_ready(aim(jax.random.split(jax.random.key(1), batching.BATCH), seen))
     few = jax.tree.map(lambda leaf: np.asarray(leaf)[:BATCH], scene)
     primitives.settle(engine, few, np.asarray(poses)[:BATCH], duration=0.01)
     return time.perf_counter() - begun

@@ -15,11 +15,13 @@ import numpy as np
 from mujoco import mjx
 
 from benchmarks.harness import Setting, alternate
-from dipn_jax import geometry, model, primitives, scenes, structs
-from dipn_jax.model import GRIPPER_DOF
+from dipn_jax import geometry, structs
+from dipn_jax.engine import PhysicsConfig
 from dipn_jax.physics import make_engine, substeps
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.structs import Scene
+from dipn_jax.world import model, primitives, scenes
+from dipn_jax.world.model import GRIPPER_DOF
 
 OBJECTS = 7
 FALL = 0.5
@@ -46,7 +48,7 @@ def heaps(seed: int, batch: int) -> tuple[Scene, np.ndarray]:
     return repeated, np.asarray(rollout.poses)[:, -1]
 
 
-def plain_mjcf(scene: Scene, config: model.PhysicsConfig) -> str:
+def plain_mjcf(scene: Scene, config: PhysicsConfig) -> str:
     """The world of one scene without the geoms that only keep layouts alike."""
     root = ElementTree.fromstring(model.mjcf(scene, config=config))
     gone = {geom.get("name") for geom in root.iter("geom") if geom.get("contype") == "8"}
@@ -62,7 +64,7 @@ def plain_mjcf(scene: Scene, config: model.PhysicsConfig) -> str:
 class Naive:
     """`jax.vmap(mjx.step)`, jitted, in a Python loop; contacts as they come."""
 
-    def __init__(self, scene: Scene, poses: np.ndarray, config: model.PhysicsConfig) -> None:
+    def __init__(self, scene: Scene, poses: np.ndarray, config: PhysicsConfig) -> None:
         """Compile for the scene `scene [B]` (the same in every row) from `poses [B, N, 7]`."""
         config = dataclasses.replace(config, geom_pairs=None, contact_points=None)
         compiled = mujoco.MjModel.from_xml_string(plain_mjcf(structs.take(scene, 0), config))

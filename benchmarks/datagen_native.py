@@ -9,11 +9,11 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from dipn_jax.datagen.generate import Job
 from mujoco import batch as mujoco_batch
 
 from benchmarks.harness import Setting, alternate, make_data
-from datagen.generate import Job
-from dipn_jax import scenes
+from dipn_jax.world import scenes
 
 ACTIONS = {"push": 3, "grasp": 6}
 """Actions tried on one scene: what the commands do unasked."""

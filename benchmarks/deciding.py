@@ -11,29 +11,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from dipn_jax.eval.clearing import instances, lockstep, methods
 from flax import nnx
 
 from benchmarks.harness import Setting, alternate, quiet, seconds
-from dipn_jax import (
-    candidates,
-    cases,
-    checkpoint,
-    clutter,
-    geometry,
-    imagine,
-    planner,
-    policy,
-    render,
-    resume,
-    scenes,
-    structs,
-)
+from dipn_jax import geometry, structs
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import VIEW, GraspConfig
 from dipn_jax.physics import make_engine
+from dipn_jax.planning import candidates, planner, policy
+from dipn_jax.sight import imagine, masks, render
+from dipn_jax.storage import checkpoint, resume
 from dipn_jax.structs import Decision, Observation, Push
 from dipn_jax.workspace import grasp_angles
-from eval import clearing, deciding, instances
+from dipn_jax.world import cases, clutter, scenes
 
 BUILTIN = pathlib.Path("builtin")
 COUNTS = (16, 64, 256)
@@ -58,7 +49,7 @@ def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> tuple[
     """Observations `[count]` of random scenes, and their slots."""
     config = scenes.parse_objects(objects, ranges=scenes.Ranges(packed=packed))
     items = clutter.settled_exactly(jax.random.key(seed), make_engine("native"), config, count)
-    return jax.device_get(clutter.observe(items.scene, items.poses)), config.slots
+    return jax.device_get(render.observe(items.scene, items.poses)), config.slots
 
 
 def _decider(preset: str, slots: int, count: int, *, fast: bool) -> Callable[[Observation, int], Decision]:
@@ -107,7 +98,7 @@ def _imagined(seen: Observation, slots: int, count: int, predictor: Any) -> Call
     @jax.jit
     def one(push: Push) -> jax.Array:
         motion = predictor(seen, jax.tree.map(lambda leaf: leaf[None], push))[0]
-        centers, _ = candidates.mask_centers(seen.label, slots)
+        centers, _ = masks.mask_centers(seen.label, slots)
         return render.rgbd(imagine.imagine(seen, centers, motion))
 
     return lambda i: one(structs.take(pushes, i))
@@ -174,19 +165,19 @@ def _same(plain: Decision, fast: Decision) -> bool:
     return bool(plain.is_push == fast.is_push and (not plain.is_push or plain.best == fast.best))
 
 
-def lockstep(setting: Setting) -> Iterator[tuple[str, float]]:
+def in_lockstep(setting: Setting) -> Iterator[tuple[str, float]]:
     """Episodes of the hard instances a minute, side by side, over one after the other."""
     engine, path = make_engine("native"), cases.hard_cases_path()
     slots, repeats = int(cases.load_cases(path)[1].shape.shape[1]), setting.pick(1, 3)
-    nets = deciding.Nets(BUILTIN, BUILTIN)
-    decide = deciding.load(deciding.Plan(), nets, engine, slots=slots)
+    nets = methods.Nets(BUILTIN, BUILTIN)
+    decide = methods.load(methods.Plan(), nets, engine, slots=slots)
 
     def tables() -> list[instances.Instance]:
         return instances.hard_instances(engine, path, None, slots=slots, repeats=repeats, seed=setting.seed)
 
     def clear(some: list[instances.Instance]) -> None:
         with tempfile.TemporaryDirectory() as name, quiet():
-            clearing.clear(some, engine, decide, resume.Partial(pathlib.Path(name), {}), seed=setting.seed)
+            lockstep.clear(some, engine, decide, resume.Partial(pathlib.Path(name), {}), seed=setting.seed)
 
     def together() -> None:
         clear(tables())

@@ -22,7 +22,9 @@ def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Ste
     import jax.numpy as jnp
     from flax import nnx
 
-    from dipn_jax import checkpoint, losses, policy
+    from dipn_jax.networks import losses
+    from dipn_jax.planning import policy
+    from dipn_jax.storage import checkpoint
 
     model: Any = checkpoint.build("grasp", GraspConfig(preset=preset))
     if work == "score":

@@ -15,7 +15,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
-from datagen import generate
+from dipn_jax.datagen import generate
+
 from dipn_jax import files
 from dipn_jax.physics import cores
 

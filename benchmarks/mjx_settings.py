@@ -8,13 +8,14 @@ from typing import Any
 
 import jax
 import numpy as np
+from dipn_jax.datagen import world
 
 from benchmarks.datagen_mjx import engine
 from benchmarks.harness import Setting, alternate
-from datagen import world
-from dipn_jax import primitives
-from dipn_jax.physics import Engine, make_engine, mjx
+from dipn_jax.engine import Engine
+from dipn_jax.physics import make_engine, mjx
 from dipn_jax.structs import Fault
+from dipn_jax.world import primitives
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "as_is": {},

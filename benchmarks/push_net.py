@@ -11,17 +11,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from dipn_jax.datagen.generate import Job, generate
+from dipn_jax.train.loop import TrainConfig, make_optimizer, make_step
+from dipn_jax.train.push import PushTask
 from flax import nnx
 
 from benchmarks import push_worker
 from benchmarks.harness import Setting, Skipped, alternate, quiet
 from benchmarks.worker import versus
-from datagen.generate import Job, generate
-from dipn_jax import candidates, checkpoint, clutter, policy, scenes, structs
+from dipn_jax import structs
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.physics import make_engine
-from train.loop import TrainConfig, make_optimizer, make_step
-from train.push import PushTask
+from dipn_jax.planning import candidates, policy
+from dipn_jax.sight import render
+from dipn_jax.storage import checkpoint
+from dipn_jax.world import clutter, scenes
 
 BATCHES = {"compact": 32, "paper": 8}
 """Examples a step, the presets' own."""
@@ -99,7 +103,7 @@ def input_share(setting: Setting) -> Iterator[tuple[str, float]]:
 def batched(setting: Setting) -> Iterator[tuple[str, float]]:
     """Seconds of one call for each candidate over one call for all: 64 pushes of a scene of 10 objects."""
     items = clutter.settled_exactly(jax.random.key(setting.seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
-    seen = jax.tree.map(lambda leaf: leaf[0], clutter.observe(items.scene, items.poses))
+    seen = jax.tree.map(lambda leaf: leaf[0], render.observe(items.scene, items.poses))
     key = jax.random.key(setting.seed)
     pushes, _ = candidates.sample_pushes(key, seen, count=CANDIDATES, slots=OBJECTS, distance=0.1)
     network: Any = checkpoint.build("dipn", DipnConfig())

@@ -23,8 +23,8 @@ def jax_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
     """One step of SGD with momentum in JAX, and the number of parameters."""
     import jax.numpy as jnp
 
-    from dipn_jax import checkpoint, losses
-    from dipn_jax.networks import dipn, push_frame
+    from dipn_jax.networks import dipn, losses, push_frame
+    from dipn_jax.storage import checkpoint
 
     inputs = push_frame.PushInput(**{name: jnp.asarray(arrays[name]) for name in FIELDS})
     model = checkpoint.build("dipn", dipn.DipnConfig(preset=preset))

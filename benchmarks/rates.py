@@ -11,16 +11,17 @@ from unittest import mock
 
 import jax
 import numpy as np
+from dipn_jax.datagen import generate
 
 from benchmarks.datagen_mjx import engine as mjx_engine
 from benchmarks.datagen_mjx import heaps
 from benchmarks.datagen_native import ACTIONS
 from benchmarks.harness import Setting, Skipped, make_data, seconds
-from datagen import generate
-from dipn_jax import primitives, scenes
-from dipn_jax.physics import Engine, EngineName, make_engine
+from dipn_jax.engine import Engine, EngineName
+from dipn_jax.physics import make_engine
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.warp import WarpEngine
+from dipn_jax.world import primitives, scenes
 
 COUNTS = (1, 3, 7, 10, 20, 30)
 FEW_ON_CPU = 4

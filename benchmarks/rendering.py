@@ -10,10 +10,13 @@ import numpy as np
 from mujoco import batch as mujoco_batch
 
 from benchmarks.harness import Setting, alternate
-from dipn_jax import clutter, model, render, scenes, structs
+from dipn_jax import structs
+from dipn_jax.engine import PhysicsConfig
 from dipn_jax.physics import cores, make_engine
+from dipn_jax.sight import render
 from dipn_jax.structs import ABSENT, Observation, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import clutter, model, scenes
 
 OBJECTS, BATCH = 10, 16
 CAMERA = 1.0
@@ -33,7 +36,7 @@ class RayCaster:
 
     def __init__(self, items: SettledScene) -> None:
         """Everything that can be made ready before the rays."""
-        texts = [model.mjcf(structs.take(items.scene, i), config=model.PhysicsConfig(), alike=True)
+        texts = [model.mjcf(structs.take(items.scene, i), config=PhysicsConfig(), alike=True)
                  for i in range(len(items.fault))]  # fmt: skip
         models = [mujoco.MjModel.from_xml_string(text) for text in texts]
         self.sims = mujoco_batch.Batch(models[0], nsim=len(models), nthread=cores())
@@ -48,7 +51,7 @@ class RayCaster:
         self.palette = np.concatenate([np.asarray(items.scene.color), table], 1)
 
     def observe(self) -> Observation:
-        """As `clutter.observe`, numpy."""
+        """As `render.observe`, numpy."""
         side = WORKSPACE.pixels
         distance, geom = self.sims.ray(self.origin, np.array([0.0, 0.0, -1.0]))
         slot = np.where(geom < 0, ABSENT, self.slot[geom])
@@ -71,12 +74,12 @@ def vs_raycast(setting: Setting) -> Iterator[tuple[str, float]]:
     caster = RayCaster(items)
     scene: Scene = jax.tree.map(jax.numpy.asarray, items.scene)
     poses = jax.numpy.asarray(items.poses)
-    _same(clutter.observe(scene, poses), caster.observe())  # also compiles
+    _same(render.observe(scene, poses), caster.observe())  # also compiles
     inner = 10  # images take a thousandth of a second each
 
     def ours() -> None:
         for _ in range(inner):
-            jax.block_until_ready(clutter.observe(scene, poses))
+            jax.block_until_ready(render.observe(scene, poses))
 
     mine, theirs = alternate(ours, caster.observe, repeats=setting.pick(5, 15))
     yield "render.vs_raycast", theirs / (mine / inner)

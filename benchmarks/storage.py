@@ -9,11 +9,14 @@ from collections.abc import Iterator
 import cv2
 import jax
 import numpy as np
+from dipn_jax.datagen.generate import Job, generate
 
 from benchmarks.harness import Setting, quiet
-from datagen.generate import Job, generate
-from dipn_jax import clutter, records, scenes, structs
+from dipn_jax import structs
+from dipn_jax.sight import render
+from dipn_jax.storage import records
 from dipn_jax.structs import Observation, PushEpisode
+from dipn_jax.world import scenes
 
 OBJECTS = 10
 DEPTH_UNIT = 1e-4
@@ -40,7 +43,7 @@ def image_bytes(episodes: PushEpisode, count: int) -> float:
     for i in np.linspace(0, len(episodes.fault) - 1, count).astype(int):
         poses = np.asarray(episodes.poses)[i]
         repeated = structs.take(episodes.scene, np.full(frames, i))
-        total += png_bytes(clutter.observe(repeated, poses))
+        total += png_bytes(render.observe(repeated, poses))
     return total / count
 
 

@@ -11,11 +11,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from datagen import world
-from dipn_jax import clutter, console, files, shapes
+from dipn_jax import batching, console, files
+from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
-from dipn_jax.physics import Engine, make_engine
+from dipn_jax.physics import make_engine
 from dipn_jax.structs import Fault
+from dipn_jax.world import shapes
+
+from . import world
 
 CAMERA_SCENES = 50
 
@@ -34,7 +37,7 @@ class Plan:
         unknown = [name for name in self.engines if name not in world.ENGINES]
         if unknown:
             raise UserError(f"--engines {' '.join(unknown)}: want some of {' '.join(world.ENGINES)}")
-        console.require_between(1, clutter.BATCH // 2, scenes=self.scenes, few=self.few)
+        console.require_between(1, batching.BATCH // 2, scenes=self.scenes, few=self.few)
         console.require_between(1, 1000, tries=self.tries)
         console.require_seed(self.seed)
 
@@ -95,7 +98,7 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
         return engine.name == "mjx" or (engine.name == "warp" and jax.default_backend() != "cpu")
 
     return {
-        "drops": lambda: world.drops(keys[0], native, clutter.BATCH),
+        "drops": lambda: world.drops(keys[0], native, batching.BATCH),
         **{f"drops-{name}": lambda name=name, e=e: crowds(name, e) for name, e in engines.items() if may_crowd(e)},  # type: ignore[misc]
         "grasps": lambda: world.isolated_grasps(native, plan.seed, plan.tries),
         "pushes": lambda: reference()[1],

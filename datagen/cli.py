@@ -10,12 +10,16 @@ from typing import Annotated, Any
 
 import tyro
 
-from datagen import check
-from datagen.generate import Job, generate
-from dipn_jax import checkpoint, console, policy, records, scenes
+from dipn_jax import console
+from dipn_jax.engine import EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.physics import EngineName
-from dipn_jax.planner import Scorer
+from dipn_jax.planning import policy
+from dipn_jax.planning.planner import Scorer
+from dipn_jax.storage import checkpoint, records
+from dipn_jax.world import scenes
+
+from . import check
+from .generate import Job, generate
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 

@@ -10,9 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import candidates, clutter, primitives, render, scenes, structs
-from dipn_jax.physics import Engine
-from dipn_jax.planner import Scorer
+from dipn_jax import batching, structs
+from dipn_jax.engine import Engine
+from dipn_jax.planning import candidates
+from dipn_jax.planning.planner import Scorer
+from dipn_jax.sight import render
 from dipn_jax.structs import (
     Fault,
     Grasp,
@@ -22,6 +24,7 @@ from dipn_jax.structs import (
     Scene,
 )
 from dipn_jax.workspace import PUSH_STEPS
+from dipn_jax.world import clutter, primitives, scenes
 
 
 @dataclasses.dataclass
@@ -65,7 +68,7 @@ def push_batch(
 
 def aim_pushes(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> tuple[Push, jax.Array]:
     """Random 10 cm pushes `[B, actions]` of what is seen of scenes `[B, N]` at `poses [B, N, 7]`; whether feasible."""
-    return clutter.in_chunks(functools.partial(_aim_pushes, actions=actions), keys, scene, poses)
+    return batching.in_chunks(functools.partial(_aim_pushes, actions=actions), keys, scene, poses)
 
 
 @functools.partial(jax.jit, static_argnames="actions")
@@ -121,7 +124,7 @@ def grasp_batch(
 
 def aim_grasps(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int, guide: Guide | None = None) -> Grasp:
     """Grasps `[B, actions]` of the foreground seen of scenes `[B, N]` at `poses [B, N, 7]`."""
-    return clutter.in_chunks(functools.partial(_aim_grasps, actions=actions, guide=guide), keys, scene, poses)
+    return batching.in_chunks(functools.partial(_aim_grasps, actions=actions, guide=guide), keys, scene, poses)
 
 
 @functools.partial(jax.jit, static_argnames=("actions", "guide"))

@@ -14,13 +14,16 @@ from typing import Any
 
 import jax
 
-from datagen import episodes
-from dipn_jax import console, files, records, structs
+from dipn_jax import console, files, structs
+from dipn_jax.engine import Engine, EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.physics import Engine, EngineName, make_engine, resolve
-from dipn_jax.planner import Scorer
-from dipn_jax.scenes import SceneConfig
+from dipn_jax.physics import make_engine, resolve
+from dipn_jax.planning.planner import Scorer
+from dipn_jax.storage import records
 from dipn_jax.workspace import PUSH_STEPS
+from dipn_jax.world.scenes import SceneConfig
+
+from . import episodes
 
 MAX_ATTEMPTS = 100
 """Batches without a single usable episode before giving up."""

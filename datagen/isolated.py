@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import scipy.spatial
 
-from dipn_jax import candidates, geometry, primitives, scenes, shapes, structs
-from dipn_jax.physics import Engine
+from dipn_jax import geometry, structs
+from dipn_jax.engine import Engine
+from dipn_jax.sight import fingers
 from dipn_jax.structs import Fault, Grasp, Scene
 from dipn_jax.workspace import GRIPPER
+from dipn_jax.world import primitives, scenes, shapes
 
 OFFSET = 0.01
 """Metres by which a try is off centre at most, along either of the gripper's axes."""
@@ -125,7 +127,7 @@ def antipodal(shape: int, size: np.ndarray, pose: np.ndarray) -> Grasp | None:
       pose: `[7]` at rest.
     """
     parts = _corners(shape, size, pose)
-    tip = float(candidates.grasp_height(max(part[:, 2].max() for part in parts)))
+    tip = float(fingers.grasp_height(max(part[:, 2].max() for part in parts)))
     found = []
     for angle in _directions(shape, size, pose):
         axis, side = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])

@@ -10,11 +10,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from datagen import episodes, isolated
-from dipn_jax import clutter, model, primitives, render, scenes, shapes, structs
-from dipn_jax.physics import Engine, EngineName, native
+from dipn_jax import structs
+from dipn_jax.engine import Engine, EngineName
+from dipn_jax.physics import native
+from dipn_jax.sight import render
 from dipn_jax.structs import Fault, Grasp, Push, SettledScene
 from dipn_jax.workspace import PUSH_STEPS
+from dipn_jax.world import clutter, model, primitives, scenes, shapes
+
+from . import episodes, isolated
 
 COUNTS = (1, 3, 7, 10, 20, 30)
 """Numbers of objects that drops are counted for."""

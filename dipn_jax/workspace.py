@@ -59,6 +59,8 @@ class Gripper:
 
 WORKSPACE = Workspace()
 GRIPPER = Gripper()
+TURNED_PIXELS = 320
+"""Pixels a side of a map into which the workspace fits at any angle (source: the paper's GN input)."""
 ROTATIONS = 16
 """Grasp and push directions, evenly in [0, 2 pi)."""
 PUSH_STEPS = 10

@@ -10,8 +10,10 @@ import pathlib
 import sys
 from typing import Any
 
+from dipn_jax.eval.clearing import sweeping
+from dipn_jax.eval.report import comparison, paper
+
 from dipn_jax import console, files
-from eval import comparison, paper, sweeping
 
 DOCS = pathlib.Path(__file__).parent
 TITLES = {

@@ -10,8 +10,9 @@ import shutil
 import sys
 from typing import Any
 
+from dipn_jax.eval.grasping import curve
+
 from dipn_jax import console, files
-from eval import grasp_curve
 
 DOCS = pathlib.Path(__file__).parent
 COUNTS = (50, 100, 200, 300, 400)
@@ -52,7 +53,7 @@ def label_table(values: dict[str, Any]) -> str:
 
 def tables(values: dict[str, Any]) -> list[str]:
     """All tables of the page."""
-    return [success_table(values), grasp_curve.table(values, COUNTS), label_table(values)]
+    return [success_table(values), curve.table(values, COUNTS), label_table(values)]
 
 
 def main() -> None:

@@ -11,8 +11,10 @@ import shutil
 import sys
 from typing import Any
 
-from dipn_jax import console, files, shapes
-from eval import curve
+from dipn_jax.eval.prediction import curve
+
+from dipn_jax import console, files
+from dipn_jax.world import shapes
 
 DOCS = pathlib.Path(__file__).parent
 SHIFTS = {

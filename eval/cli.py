@@ -9,12 +9,21 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from dipn_jax import checkpoint, console, files, policy, resume, scenes
+from dipn_jax import console, files
+from dipn_jax.engine import EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.physics import EngineName, make_engine
-from eval import clearing, clearing_cli, grasp_curve, grasping, options, prediction
-from eval import curve as curves
-from eval import report as reporting
+from dipn_jax.physics import make_engine
+from dipn_jax.planning import policy
+from dipn_jax.storage import checkpoint, resume
+from dipn_jax.world import scenes
+
+from . import options
+from .clearing import command, lockstep
+from .grasping import curve as grasp_curves
+from .grasping import success
+from .prediction import curve as curves
+from .prediction import push_errors
+from .report import page as reporting
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
@@ -63,7 +72,7 @@ def predict(
     if push_net:
         networks = {"dipn": checkpoint.load_network(inputs[0], network="dipn"), **networks}  # type: ignore[dict-item]
     partial = resume.Partial(out, settings, inputs=inputs)
-    values, films = prediction.evaluate(
+    values, films = push_errors.evaluate(
         networks,
         make_engine(engine),
         config,
@@ -122,19 +131,19 @@ def grasp(
     config = scenes.parse_objects(objects, ranges=ranges)
     run = checkpoint.find(grasp_net, network="grasp") if grasp_net else None
     partial = resume.Partial(out, settings, inputs=[run] if run else [])
-    values: dict[str, Any] = grasp_curve.summary(grasp_curve.load(curve))
+    values: dict[str, Any] = grasp_curves.summary(grasp_curves.load(curve))
     if run:
         physics = make_engine(engine)
-        found, tables = grasping.evaluate(
+        found, tables = success.evaluate(
             policy.load_scorer(run), physics, config, partial, scenes=scenes_, seed=seed, others=others
         )
-        alone = grasping.label_agreement(physics, scenes.parse_objects("1", ranges=ranges), scenes=scenes_, seed=seed)
+        alone = success.label_agreement(physics, scenes.parse_objects("1", ranges=ranges), scenes=scenes_, seed=seed)
         values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
-        clearing.save(tables, out)
-        grasping.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
+        lockstep.save(tables, out)
+        success.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
     if curve:
         out.mkdir(parents=True, exist_ok=True)
-        grasp_curve.figure(values).savefig(out / "curve.png", dpi=130)
+        grasp_curves.figure(values).savefig(out / "curve.png", dpi=130)
     options.finish(out, values, settings, partial)
 
 
@@ -168,8 +177,8 @@ def report(
 COMMANDS = {
     "prediction": predict,
     "grasp": grasp,
-    "clear": clearing_cli.clear,
-    "sweep": clearing_cli.sweep,
+    "clear": command.clear,
+    "sweep": command.sweep,
     "report": report,
 }
 

@@ -6,8 +6,10 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from dipn_jax import console, resume
-from eval import metrics
+from dipn_jax import console
+from dipn_jax.storage import resume
+
+from . import metrics
 
 
 def check(out: pathlib.Path, seed: int, **counts: int) -> None:

@@ -10,10 +10,11 @@ import dipn_jax  # noqa: F401  isort: skip  settings that must be made before JA
 import jax
 import numpy as np
 import pytest
+from dipn_jax.datagen.generate import Job, generate
 
-from datagen.generate import Job, generate
-from dipn_jax import clutter, console, scenes
+from dipn_jax import console
 from dipn_jax.physics import make_engine
+from dipn_jax.world import clutter, scenes
 
 console.enable_compilation_cache()
 

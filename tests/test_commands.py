@@ -7,13 +7,14 @@ import subprocess
 import sys
 
 import pytest
+from dipn_jax.datagen import cli as datagen_cli
+from dipn_jax.eval import cli as eval_cli
+from dipn_jax.train import cli as train_cli
 from flax import nnx
 
-from datagen import cli as datagen_cli
-from dipn_jax import checkpoint, console, records
+from dipn_jax import console
 from dipn_jax.networks.grasp import GraspConfig
-from eval import cli as eval_cli
-from train import cli as train_cli
+from dipn_jax.storage import checkpoint, records
 
 COMMANDS = {"datagen": datagen_cli.COMMANDS, "train": train_cli.COMMANDS, "eval": eval_cli.COMMANDS}
 
@@ -138,7 +139,7 @@ def test_a_reader_that_has_seen_enough_is_no_mistake() -> None:
     ours, theirs = os.pipe()
     os.close(ours)
     done = subprocess.run(
-        [sys.executable, "-m", "eval.cli", "--help"], stdout=theirs, stderr=subprocess.PIPE, check=False
+        [sys.executable, "-m", "dipn_jax.eval.cli", "--help"], stdout=theirs, stderr=subprocess.PIPE, check=False
     )
     os.close(theirs)
     assert done.returncode == 141 and not done.stderr

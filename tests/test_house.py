@@ -16,36 +16,48 @@ ROOT = pathlib.Path(__file__).parent.parent
 STAGES = ("datagen", "train", "eval")
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "files", "structs", "workspace", "geometry", "shapes", "packing", "scenes", "cases", "model", "physics",
-    "primitives", "render", "segment", "candidates", "imagine", "losses", "networks", "planner", "codec",
-    "records", "checkpoint", "clutter", "policy", "resume", "console",
+    "errors", "files", "structs", "workspace", "geometry", "batching", "engine",
+    "world", "physics", "sight", "networks", "storage", "planning", "console",
 ]  # fmt: skip
 
 
 def _imports(path: pathlib.Path) -> set[str]:
+    """Full names of what a file imports: of `from a import b` both `a` and `a.b`; relative ones from `dipn_jax` on."""
+    package = [*_package(path)]
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            names |= {module} | {f"{module}.{alias.name}" for alias in node.names}
     return names
 
 
-def _tops(path: pathlib.Path) -> set[str]:
-    return {name.split(".")[0] for name in _imports(path)}
+def _package(path: pathlib.Path) -> tuple[str, ...]:
+    """The package that a file is in, as it is imported."""
+    parts = path.relative_to(ROOT).parent.parts
+    return parts if parts[0] == "dipn_jax" else ("dipn_jax", *parts)
+
+
+def _within(names: set[str], place: str) -> list[str]:
+    return sorted(name for name in names if name == place or name.startswith(f"{place}."))
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_stages_import_the_library_and_never_one_another(stage: str) -> None:
     for path in (ROOT / stage).rglob("*.py"):
-        assert not _tops(path) & (set(STAGES) - {stage}), path
+        names = _imports(path)
+        for other in set(STAGES) - {stage}:
+            assert not _within(names, other) + _within(names, f"dipn_jax.{other}"), path
+        assert not _within(names, stage), f"{path}: a stage imports its own modules as `from . import`"
 
 
 def test_the_library_imports_no_stage() -> None:
     for path in (ROOT / "dipn_jax").rglob("*.py"):
-        assert not _tops(path) & set(STAGES), path
+        for stage in STAGES:
+            assert not _within(_imports(path), stage) + _within(_imports(path), f"dipn_jax.{stage}"), path
 
 
 def test_inside_the_library_the_arrows_point_one_way() -> None:
@@ -54,14 +66,18 @@ def test_inside_the_library_the_arrows_point_one_way() -> None:
         if room in ("__init__", "data"):
             continue
         assert room in ORDER, f"{room}: give it a place in ORDER"
-        for name in _imports(path):
-            parts = name.split(".")
-            if parts[0] == "dipn_jax" and len(parts) > 1 and parts[1] in ORDER and parts[1] != room:
-                assert ORDER.index(parts[1]) < ORDER.index(room), f"{room} imports {parts[1]}"
+        for other in set(ORDER) - {room}:
+            if found := _within(_imports(path), f"dipn_jax.{other}"):
+                assert ORDER.index(other) < ORDER.index(room), f"{path} imports {found}"
 
 
 def test_planner_knows_no_physics_and_networks_no_simulation() -> None:
-    rules = (("planner.py", "physics"), ("planner.py", "networks"), ("networks", "physics"), ("networks", "scenes"))
+    rules = (
+        ("planning/planner.py", "physics"),
+        ("planning/planner.py", "networks"),
+        ("networks", "physics"),
+        ("networks", "world"),
+    )
     for room, forbidden in rules:
         place = ROOT / "dipn_jax" / room
         for path in [place] if place.is_file() else place.glob("*.py"):
@@ -70,8 +86,8 @@ def test_planner_knows_no_physics_and_networks_no_simulation() -> None:
 
 def _public_functions() -> list[tuple[str, object]]:
     found = []
-    for package in ("dipn_jax", *STAGES):
-        for info in pkgutil.walk_packages([str(ROOT / package)], f"{package}."):
+    for package in ("dipn_jax", *(f"dipn_jax.{stage}" for stage in STAGES)):
+        for info in pkgutil.walk_packages([str(ROOT / package.split(".")[-1])], f"{package}."):
             module = importlib.import_module(info.name)
             for name, item in vars(module).items():
                 item = inspect.unwrap(item) if callable(item) else item
@@ -91,7 +107,7 @@ def test_conventions() -> None:
         keys = [i for i, p in enumerate(parameters) if p.name == "key"]
         assert keys in ([], [0]), f"{name}: the key comes first"
         for p in parameters:
-            if p.default is not p.empty and name.split(".")[1] != "cli" and name.startswith("dipn_jax"):
+            if p.default is not p.empty and not name.startswith(tuple(f"dipn_jax.{stage}." for stage in STAGES)):
                 positional = p.kind is p.POSITIONAL_OR_KEYWORD
                 allowed = {"fill", "config", "arguments", "note", "threads"}
                 assert not positional or p.name in allowed, f"{name}: option {p.name} is keyword-only"
@@ -129,9 +145,9 @@ def test_the_wheel_holds_all_four_packages_and_the_data(tmp_path: pathlib.Path) 
         [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(site), str(wheel)], check=True
     )
     script = (
-        "import dipn_jax.scenes, datagen.cli, train.cli, eval.cli, pathlib; "
-        "assert len(dipn_jax.cases.load_cases(dipn_jax.cases.hard_cases_path())[0]) == 10; "
-        "import dipn_jax.checkpoint as c; "
+        "import dipn_jax.world.cases, dipn_jax.datagen.cli, dipn_jax.train.cli, dipn_jax.eval.cli, pathlib; "
+        "assert len(dipn_jax.world.cases.load_cases(dipn_jax.world.cases.hard_cases_path())[0]) == 10; "
+        "import dipn_jax.storage.checkpoint as c; "
         "[c.load_network(pathlib.Path('builtin'), network=name) for name in ('dipn', 'grasp')]; "
         "assert pathlib.Path(dipn_jax.__file__).is_relative_to(pathlib.Path.cwd() / 'site'), dipn_jax.__file__"
     )

@@ -11,11 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import candidates, clutter, policy, primitives, render, structs
+from dipn_jax import structs
+from dipn_jax.engine import Engine
 from dipn_jax.networks.vpg import VPG
-from dipn_jax.physics import Engine
-from dipn_jax.planner import Scorer
+from dipn_jax.planning import candidates, policy
+from dipn_jax.planning.planner import Scorer
+from dipn_jax.sight import fingers, render
 from dipn_jax.structs import Array, Fault, Grasp, Push, Pytree, Scene
+from dipn_jax.world import clutter, primitives
 
 EXPLORE = (0.5, 0.1, 0.9998)
 """Share of random actions at first and at last, and its decay per action. Source: VPG's released code."""
@@ -70,7 +73,7 @@ def look(
         push_key, grasp_key = jax.random.split(args[0])
         seen = render.render(*args[1:])
         image = render.rgbd(seen)[None]
-        possible = candidates.pushable(seen.height)
+        possible = fingers.pushable(seen.height)
         values = pushes(image)[0] if pushes else jnp.zeros(possible.shape)
         push_index, push_value = candidates.best_grasp(jnp.where(possible, values, -jnp.inf))
         slots = args[1].shape.shape[0]

@@ -18,18 +18,21 @@ import numpy as np
 import optax
 from flax import nnx
 
-from dipn_jax import checkpoint, files, losses, structs
+from dipn_jax import files, structs
+from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
+from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VpgConfig
-from dipn_jax.physics import Engine
-from dipn_jax.planner import Scorer
-from dipn_jax.scenes import SceneConfig
+from dipn_jax.planning.planner import Scorer
+from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Grasp, GraspEpisode
-from train import acting, tables
-from train.acting import Look
-from train.grasp import PHASE, WINDOWS, Window, view, windows
-from train.loop import make_step
-from train.rounds import Run
+from dipn_jax.world.scenes import SceneConfig
+
+from . import acting, tables
+from .acting import Look
+from .grasp import PHASE, WINDOWS, Window, view, windows
+from .loop import make_step
+from .rounds import Run
 
 MethodName = Literal["vpg", "rea", "dqn"]
 PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}

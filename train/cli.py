@@ -6,15 +6,20 @@ import pathlib
 import sys
 from typing import Any, Literal
 
-from dipn_jax import checkpoint, console, policy, scenes
+from dipn_jax import console
+from dipn_jax.engine import EngineName
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.physics import EngineName, make_engine
-from train import baseline as baselines
-from train import online
-from train.grasp import GraspTask, PretrainTask
-from train.loop import Task, TrainConfig, fit
-from train.push import PushTask
+from dipn_jax.physics import make_engine
+from dipn_jax.planning import policy
+from dipn_jax.storage import checkpoint
+from dipn_jax.world import scenes
+
+from . import baseline as baselines
+from . import online
+from .grasp import GraspTask, PretrainTask
+from .loop import Task, TrainConfig, fit
+from .push import PushTask
 
 Preset = Literal["compact", "paper"]
 ShapeClass = Literal["cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave"]

@@ -12,12 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import clutter, console, geometry, losses, records, render, scenes, shapes, structs
+from dipn_jax import batching, console, geometry, structs
 from dipn_jax.errors import UserError
-from dipn_jax.networks import grasp
+from dipn_jax.networks import grasp, losses
+from dipn_jax.sight import fingers, render
+from dipn_jax.storage import records
 from dipn_jax.structs import ABSENT, Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
-from train.split import split
+from dipn_jax.world import scenes, shapes
+
+from .split import split
 
 PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
@@ -46,7 +50,7 @@ def _flips(key: jax.Array, images: jax.Array, *others: jax.Array) -> list[jax.Ar
 
 
 class PretrainTask:
-    """Every pixel of a randomly turned image against `grasp.geometric_labels`: no physics."""
+    """Every pixel of a randomly turned image against `fingers.geometric_labels`: no physics."""
 
     network = "grasp"
 
@@ -71,7 +75,7 @@ class PretrainTask:
             center = jax.random.uniform(shift_key, (2,), minval=-0.08, maxval=0.08)
             seen = turned_view(scene, poses, center, angle, pixels=PRETRAIN_VIEW)
             weight = jnp.where(seen.label >= 0, 1.0, TABLE_WEIGHT)
-            return render.rgbd(seen), grasp.geometric_labels(seen.height), weight
+            return render.rgbd(seen), fingers.geometric_labels(seen.height), weight
 
         return jax.lax.map(one, (settled.scene, settled.poses, jax.random.split(key, settled.fault.shape[0])))
 
@@ -121,7 +125,7 @@ def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
 
 def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
     """Windows `[B]`, `pixels` a side, of episodes `[B]`; numpy."""
-    return jax.device_get(clutter.in_chunks(functools.partial(_windows, pixels=pixels), episodes))
+    return jax.device_get(batching.in_chunks(functools.partial(_windows, pixels=pixels), episodes))
 
 
 def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array:
@@ -198,7 +202,7 @@ class GraspTask:
         return structs.take(self._kept[name], index)
 
     def _prepare_all(self, episodes: GraspEpisode) -> Window:
-        made, count, some = [], len(episodes.fault), 8 * clutter.BATCH
+        made, count, some = [], len(episodes.fault), 8 * batching.BATCH
         with console.Progress("render windows", count, unit="grasps") as progress:
             for begin in range(0, count, some):
                 made.append(self.prepare(structs.take(episodes, slice(begin, begin + some))))
@@ -212,7 +216,7 @@ class GraspTask:
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss and accuracy on held-out grasps."""
         graph, state = nnx.split(model)
-        size, rows, count = clutter.BATCH, [], len(self.test_set.fault)
+        size, rows, count = batching.BATCH, [], len(self.test_set.fault)
         for begin in range(0, count, size):
             index = np.arange(begin, begin + size)
             weight = (index < count).astype(np.float32)

@@ -16,8 +16,9 @@ import optax
 import tensorboardX
 from flax import nnx
 
-from dipn_jax import checkpoint, console, files
+from dipn_jax import console, files
 from dipn_jax.errors import UserError
+from dipn_jax.storage import checkpoint
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
 import grain  # noqa: E402

@@ -14,17 +14,22 @@ import numpy as np
 import optax
 from flax import nnx
 
-from dipn_jax import candidates, checkpoint, clutter, files, render, structs
+from dipn_jax import files, structs
+from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig, score_image
-from dipn_jax.physics import Engine
-from dipn_jax.scenes import SceneConfig
+from dipn_jax.planning import candidates
+from dipn_jax.sight import render
+from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
-from train import tables
-from train.grasp import PHASE, WINDOWS, Window, executed_loss, windows
-from train.loop import make_step
-from train.rounds import Run
-from train.tables import Tables
+from dipn_jax.world import clutter
+from dipn_jax.world.scenes import SceneConfig
+
+from . import tables
+from .grasp import PHASE, WINDOWS, Window, executed_loss, windows
+from .loop import make_step
+from .rounds import Run
+from .tables import Tables
 
 RECENT = 50
 """Grasps over which the success of the moment is counted."""

@@ -12,13 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import clutter, console, geometry, losses, records, render, segment, shapes, structs
+from dipn_jax import batching, console, geometry, structs
 from dipn_jax.errors import UserError
-from dipn_jax.networks import dipn, push_frame
+from dipn_jax.networks import dipn, losses, push_frame
 from dipn_jax.networks.push_frame import PushInput, View
+from dipn_jax.sight import render, segment
+from dipn_jax.storage import records
 from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
-from train.split import split
+from dipn_jax.world import shapes
+
+from .split import split
 
 
 @flax.struct.dataclass
@@ -110,8 +114,8 @@ class PushTask:
         """Examples of a whole set, in memory on the host: about 20 KB a push of seven objects."""
         parts, count = [], len(episodes.fault)
         with console.Progress("render examples", count, unit="pushes") as progress:
-            for begin in range(0, count, clutter.BATCH):
-                rows = np.arange(begin, begin + clutter.BATCH) % count
+            for begin in range(0, count, batching.BATCH):
+                rows = np.arange(begin, begin + batching.BATCH) % count
                 part: Example = structs.take(self.prepare(structs.take(episodes, rows)), slice(0, count - begin))
                 parts.append(part.replace(inputs=part.inputs.replace(crops=part.inputs.crops.astype(np.float16))))
                 progress.advance(len(part.taught), "")

@@ -8,7 +8,8 @@ from typing import Any, Protocol, TypeVar
 
 from flax import nnx
 
-from dipn_jax import checkpoint, console, files, resume
+from dipn_jax import console, files
+from dipn_jax.storage import checkpoint, resume
 
 
 class State(Protocol):

@@ -8,11 +8,12 @@ import functools
 import jax
 import numpy as np
 
-from dipn_jax import clutter, structs
-from dipn_jax.physics import Engine
-from dipn_jax.scenes import SceneConfig
+from dipn_jax import structs
+from dipn_jax.engine import Engine
 from dipn_jax.structs import Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import clutter
+from dipn_jax.world.scenes import SceneConfig
 
 PATIENCE = 3
 """Actions without effect in a row before a table is set anew."""

@@ -12,33 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import candidates, geometry, render
+from dipn_jax import geometry
 from dipn_jax.errors import UserError
 from dipn_jax.networks import resnet
-from dipn_jax.workspace import GRIPPER, ROTATIONS, WORKSPACE, grasp_angles
+from dipn_jax.sight import fingers, render
+from dipn_jax.workspace import ROTATIONS, TURNED_PIXELS, WORKSPACE, grasp_angles
 
-VIEW = 320
-"""Pixels of the padded, rotated input: the turned 224 pixel map fits."""
-
-
-MIN_DEPTH = 0.002
-"""Metres of object that must be between the fingers; objects 25 mm high lie 5 mm over the lowest fingertip."""
+VIEW = TURNED_PIXELS
+"""Pixels of the padded, rotated input."""
 SCALE = (0.5, 0.5, 0.5, 0.05)
 """What red, green, blue (in [0, 1]) and height (metres) are divided by."""
-EMPTY = 0.005
-"""Metres above the table up to which a pixel shows none of an object: no grasp is centred there, and none is learnt."""
-BLOCKED = 0.02
-"""Metres by which something under a finger stands over where its tip is to go: it can rarely push that aside."""
-WALL = 1.0
-"""Metres: what an object at the border of the image is taken for beyond it, where nobody sees it."""
-HIDDEN = 12
-"""Pixels along the border by which such an object may be wider out of sight: half a large one."""
 BLOCK = 4
 """Pixels a side of a cell: the compact network works on cells."""
-FINGER_COLUMNS = tuple(
-    round(off / WORKSPACE.pixel) for off in (GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness)
-)
-"""Pixels from the middle of a grasp to where a finger begins and ends."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +148,7 @@ def score_image(
         views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, VIEW) + table)(angles)
         scores = squash(network(views))
         scores = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
-    return jnp.where(image[..., 3] > EMPTY, scores, 0.0) if action == "grasp" else scores
+    return jnp.where(image[..., 3] > fingers.EMPTY_HEIGHT, scores, 0.0) if action == "grasp" else scores
 
 
 def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
@@ -171,8 +156,8 @@ def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
 
     A mirror image of a grasp is as good as the grasp, and both mirrors map the 16 angles onto themselves; so this is
     four answers to one question. The best of a million scores is an overestimate; the least of four makes up for it.
-    And what the height map alone speaks against (`blocked_image`) has its score halved: four in ten of such grasps
-    that the network believes in hold, of the others 99 %; see docs/clearing.md.
+    And what the height map alone speaks against (`fingers.blocked_image`) has its score halved: four in ten of such
+    grasps that the network believes in hold, of the others 99 %; see docs/clearing.md.
     """
     turned_back = -np.arange(ROTATIONS) % ROTATIONS
 
@@ -181,7 +166,7 @@ def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
         return scores[turned_back] if len(axes) == 1 else scores
 
     answers = [score_image(network, image), mirrored((0,)), mirrored((1,)), mirrored((0, 1))]
-    return functools.reduce(jnp.minimum, answers) * (1 - blocked_image(image[..., 3]) / 2)
+    return functools.reduce(jnp.minimum, answers) * (1 - fingers.blocked_image(image[..., 3]) / 2)
 
 
 def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:
@@ -217,68 +202,3 @@ def turning_tables(turns: int) -> tuple[np.ndarray, np.ndarray]:
         back = jax.vmap(lambda v, a: geometry.unrotate_map(v, a, side))(views, angles)
         there = resnet.space_to_depth(turned[..., None], BLOCK)
     return np.asarray(there), np.asarray(back)
-
-
-def geometric_labels(height: jax.Array) -> jax.Array:
-    """Which grasps are free of physics' objections, from the height map of a turned view alone.
-
-    A grasp centred on a pixel and closing along its row is positive when there is object between the
-    fingers at the depth they would reach, and none where they come down: a pad's width of rows, and
-    `FINGER_COLUMNS` on each side (DIPN's released code has rows +-4, columns 19 to 28 of its own gripper).
-
-    Args:
-      height: `[H, W]` metres.
-
-    Returns:
-      `[H, W]` float, 1 for positive.
-    """
-    tip = candidates.grasp_height(height)
-    return ((height > tip + MIN_DEPTH) & (_under_fingers(height) < tip)).astype(jnp.float32)
-
-
-def _under_fingers(height: jax.Array) -> jax.Array:
-    """The highest point, metres, that the fingers of a grasp centred on each pixel `[H, W]` come down on."""
-
-    def highest(low: int, high: int, half_rows: int) -> jax.Array:
-        rows, cols = 2 * half_rows + 1, high - low + 1
-        pad = ((half_rows, half_rows), (-low if low < 0 else 0, high if high > 0 else 0))
-        top = jnp.pad(height, pad)
-        for window in ((rows, 1), (1, cols)):  # a maximum over a rectangle is one of rows, then one of columns
-            top = jax.lax.reduce_window(top, -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
-        begin = low if low > 0 else 0
-        return top[:, begin : begin + height.shape[1]]
-
-    near, far = FINGER_COLUMNS
-    rows = round(GRIPPER.pad_width / 2 / WORKSPACE.pixel)
-    return jnp.maximum(highest(-far, -near, rows), highest(near, far, rows))
-
-
-def label_image(height: jax.Array) -> jax.Array:
-    """`geometric_labels` of every grasp on a height map `[224, 224]`: `[16, 224, 224]`, as `score_image`."""
-    return _of_every_grasp(height, geometric_labels)
-
-
-def blocked_image(height: jax.Array) -> jax.Array:
-    """Which grasps on a height map `[224, 224]` a finger stops short of: `[16, 224, 224]`, 1 where so, else 0.
-
-    It would come down on something that stands BLOCKED over where its tip is to go, or out of sight near something
-    that reaches the border.
-    """
-    height = jnp.pad(height, (VIEW - WORKSPACE.pixels) // 2, mode="edge")
-    outside = jnp.abs(jnp.arange(VIEW) - (VIEW - 1) / 2) > WORKSPACE.pixels / 2
-    beyond = jnp.where(outside[:, None] | outside, height, 0.0)
-    hidden = jax.lax.reduce_window(beyond, 0.0, jax.lax.max, (2 * HIDDEN + 1,) * 2, (1, 1), "SAME") > EMPTY
-    height = jnp.where((outside[:, None] | outside) & hidden, WALL, height)
-    return _of_every_grasp(
-        height, lambda turned: (_under_fingers(turned) > candidates.grasp_height(turned) + BLOCKED).astype(jnp.float32)
-    )
-
-
-def _of_every_grasp(height: jax.Array, judge: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """`judge` of turned views, turned back: `[16, 224, 224]`; a grasp turned by half a turn is the same grasp."""
-
-    def one(angle: jax.Array) -> jax.Array:
-        return geometry.unrotate_map(judge(geometry.rotate_map(height, angle, VIEW)), angle, WORKSPACE.pixels)
-
-    half = jax.lax.map(one, jnp.asarray(grasp_angles()[: ROTATIONS // 2]))
-    return jnp.tile(half, (2, 1, 1))

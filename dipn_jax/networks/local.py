@@ -19,7 +19,6 @@ from flax import nnx
 from dipn_jax import geometry
 from dipn_jax.networks.grasp import (
     BLOCK,
-    EMPTY,
     SCALE,
     VIEW,
     GraspNet,
@@ -28,6 +27,7 @@ from dipn_jax.networks.grasp import (
     score_image,
     turning_tables,
 )
+from dipn_jax.sight import fingers
 from dipn_jax.workspace import ROTATIONS
 
 FEW = 8
@@ -79,7 +79,7 @@ def _felt(cells: jax.Array, least: jax.Array, extent: jax.Array, axis: int) -> j
 
 def _scores(logits: jax.Array, height: jax.Array) -> jax.Array:
     """Scores of pixels of normalized `height`; 0 on the table."""
-    return jnp.where(height * SCALE[3] > EMPTY, nnx.sigmoid(logits), 0.0)
+    return jnp.where(height * SCALE[3] > fingers.EMPTY_HEIGHT, nnx.sigmoid(logits), 0.0)
 
 
 def scores_now(network: GraspNet, now: jax.Array) -> jax.Array:

@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import candidates, geometry, losses
+from dipn_jax import geometry
+from dipn_jax.networks import losses
+from dipn_jax.sight import masks
 from dipn_jax.structs import ABSENT, Push, Pytree
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS, WORKSPACE
 
@@ -93,7 +95,7 @@ def push_input(
     Returns:
       The network's input, and the mask centroids `[N, 2]` in the workspace (metres).
     """
-    centers, area = candidates.mask_centers(label, slots)
+    centers, area = masks.mask_centers(label, slots)
     start_offset = np.array(START_PIXEL, np.float32)
     image = jnp.stack([label.astype(jnp.float32), height / HEIGHT_UNIT], -1) if view.context else label[..., None]
 
@@ -142,7 +144,7 @@ def outlines(label: jax.Array, height: jax.Array, angle: jax.Array, centers: jax
       label: `[H, W]` int32.
       height: `[H, W]` metres.
       angle: `[]` radians.
-      centers: `[N, 2]` metres, workspace (`candidates.mask_centers`).
+      centers: `[N, 2]` metres, workspace (`masks.mask_centers`).
 
     Returns:
       `[N, DIRECTIONS, 2]` metres, pixel centres: of the whole mask, and of what is as high as the fingertips of a push.

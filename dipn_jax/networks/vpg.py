@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from dipn_jax import render
 from dipn_jax.errors import UserError
 from dipn_jax.networks import resnet
 from dipn_jax.networks.grasp import SCALE, GraspConfig, GraspNet
+from dipn_jax.sight import render
 
 PARTS = ("push", "grasp")
 GROWTH = 32

@@ -1,6 +1,6 @@
 """One interface, three engines: `native` (MuJoCo C on CPU threads), `mjx` (XLA: GPU, TPU, CPU) and `warp` (NVIDIA).
 
-All read the same MJCF (`dipn_jax.model`), take the same arguments and return the same result, so which
+All read the same MJCF (`dipn_jax.world.model`), take the same arguments and return the same result, so which
 one runs is a configuration value.
 """
 
@@ -9,16 +9,14 @@ from __future__ import annotations
 import dataclasses
 import os
 from types import ModuleType
-from typing import Any, Literal, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from dipn_jax.engine import Engine, EngineName, PhysicsConfig
 from dipn_jax.errors import UserError
-from dipn_jax.model import PhysicsConfig
-from dipn_jax.structs import Array, Rollout, Scene, Trajectory
-
-EngineName = Literal["auto", "native", "mjx", "warp"]
+from dipn_jax.structs import Array
 
 CONTROL_PERIOD = 0.01
 """Seconds between set points; faults are looked for as often."""
@@ -67,54 +65,6 @@ def substeps(config: PhysicsConfig) -> int:
             f"physics timestep {config.timestep}: want {CONTROL_PERIOD} over a whole number from 1 to {MOST_SUBSTEPS}"
         )
     return count
-
-
-class Engine(Protocol):
-    """Simulates batches of independent scenes.
-
-    Threads may share one: `native` steps their batches side by side, the others one by one.
-    """
-
-    name: str
-    config: PhysicsConfig
-    batch: int
-    """Scenes it is best given at a time: data sets are made in batches of as many."""
-
-    def simulate(
-        self,
-        scenes: Scene,
-        poses: Array,
-        trajectories: Trajectory,
-        samples: Array,
-        *,
-        settle: bool = False,
-        fence: float = 0.0,
-    ) -> Rollout:
-        """Follow `trajectories` from rest.
-
-        Args:
-          scenes: `[B, N, ...]`.
-          poses: `[B, N, 7]` initial poses; velocities are zero.
-          trajectories: `time [B, K]`, `target [B, K, 5]`; the gripper starts at the first key frame.
-          samples: `[S]` seconds, increasing, common to the batch; the simulation ends at the last.
-          settle: flag episodes in which something still moves at the end.
-          fence: seconds from the start for which objects are kept near the workspace's centre (`fence_force`).
-
-        Returns:
-          Rollout with a leading `[B]`; what went wrong is in `fault [B]`.
-
-        Raises:
-          Stopped: `stop` was called.
-        """
-        ...
-
-    def stop(self) -> None:
-        """From another thread: end `simulate`, now and from now on, as soon as can be."""
-        ...
-
-
-class Stopped(Exception):
-    """An engine was told to stop."""
 
 
 def resolve(name: EngineName) -> EngineName:

@@ -6,9 +6,9 @@ from types import ModuleType
 
 import jax.numpy as jnp
 
-from dipn_jax import shapes
 from dipn_jax.structs import Array, Fault, Scene
 from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import shapes
 
 MAX_SPEED = 5.0
 """m/s; a drop from 1.2 m ends at 4.9 m/s."""

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 
 from dipn_jax import physics
-from dipn_jax.model import GRIPPER_DOF
 from dipn_jax.physics import faults
 from dipn_jax.structs import Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
+from dipn_jax.world.model import GRIPPER_DOF
 
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 _FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}FULL")) for name in ("CONTACT", "CNSTR")]

@@ -21,14 +21,16 @@ from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 from mujoco.mjx._src.types import GeomType
 
-from dipn_jax import model, physics, shapes
+from dipn_jax import physics
+from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.errors import UserError
-from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
 from dipn_jax.physics import cone, faults, kept, prisms, recording
 from dipn_jax.physics.recording import Record, State
-from dipn_jax.scenes import parked
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
+from dipn_jax.world import model, shapes
+from dipn_jax.world.model import GRIPPER_DOF
+from dipn_jax.world.scenes import parked
 
 DEFAULTS = PhysicsConfig(
     timestep=0.0025,  # as near to the native engine's 0.002 as its own 0.001 is; at 0.005 1 grasp in 10 ends otherwise
@@ -42,7 +44,7 @@ SAMPLES = 12
 
 
 class MjxEngine:
-    """See `physics.Engine`."""
+    """See `Engine`."""
 
     name = "mjx"
 
@@ -84,7 +86,7 @@ class MjxEngine:
         settle: bool = False,
         fence: float = 0.0,
     ) -> Rollout:
-        """See `physics.Engine.simulate`; numpy arrays out."""
+        """See `Engine.simulate`; numpy arrays out."""
         ticks = np.round(np.asarray(samples) / physics.CONTROL_PERIOD).astype(np.int32)
         padded = np.append(ticks, np.full(max(SAMPLES - len(ticks), 0), -1, np.int32))
         args = jax.tree.map(np.asarray, (scenes, poses, _pad(trajectories)))
@@ -98,7 +100,7 @@ class MjxEngine:
                 rows = np.minimum(np.arange(start, start + size), batch - 1)
                 part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)
                 if self._stopped.is_set():
-                    raise physics.Stopped
+                    raise Stopped
                 whole = *part, _room(size, len(padded), slots), padded, np.bool_(settle), np.float32(fence)
                 fresh = self._program(size, slots, whole)(*whole)
                 done = [*done[:-1], *jax.device_get(done[-1:]), fresh]  # fetched while the next one runs
@@ -146,7 +148,7 @@ class MjxEngine:
         return run
 
     def stop(self) -> None:
-        """See `physics.Engine.stop`: at the end of the chunk at hand."""
+        """See `Engine.stop`: at the end of the chunk at hand."""
         self._stopped.set()
 
 

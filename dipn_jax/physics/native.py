@@ -11,12 +11,14 @@ import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
 
-from dipn_jax import model, physics, structs
-from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
+from dipn_jax import physics, structs
+from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.physics import hosted
-from dipn_jax.scenes import parked
 from dipn_jax.structs import ABSENT, Array, Rollout, Scene, Trajectory
 from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import model
+from dipn_jax.world.model import GRIPPER_DOF
+from dipn_jax.world.scenes import parked
 
 DEFAULTS = PhysicsConfig(sleep=1e-3)  # halves the time; 5 cm of a push: 0.01 mm (p50), 0.4 mm (p90) from never
 CAMERA = 1.0
@@ -26,7 +28,7 @@ MODELS_KEPT = 256
 
 
 class NativeEngine:
-    """See `physics.Engine`. Results do not depend on the number of threads."""
+    """See `Engine`. Results do not depend on the number of threads."""
 
     name = "native"
     batch = 64
@@ -47,7 +49,7 @@ class NativeEngine:
         settle: bool = False,
         fence: float = 0.0,
     ) -> Rollout:
-        """See `physics.Engine.simulate`; arrays in, numpy arrays out."""
+        """See `Engine.simulate`; arrays in, numpy arrays out."""
         scenes, trajectories = jax.tree.map(np.asarray, (scenes, trajectories))
         poses = np.asarray(poses)
         packed, slots = hosted.pack(scenes, poses)
@@ -62,7 +64,7 @@ class NativeEngine:
         return hosted.follow(sims, packed, slots, poses, trajectories, np.asarray(samples), settle=settle, fence=fence)
 
     def stop(self) -> None:
-        """See `physics.Engine.stop`."""
+        """See `Engine.stop`."""
         self.stopped.set()
 
     def _compile(self, scenes: Scene) -> list[mujoco.MjModel]:
@@ -102,7 +104,7 @@ class _Worlds:
     def advance(self) -> tuple[np.ndarray, np.ndarray]:
         """See `hosted.Worlds`."""
         if self._engine.stopped.is_set():
-            raise physics.Stopped
+            raise Stopped
         try:
             self._batch.step(nstep=self._engine.substeps)
         except mujoco_batch.SimulationError as error:
@@ -136,7 +138,7 @@ def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray) -> np.ndarray
 
 
 def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> tuple[np.ndarray, np.ndarray]:
-    """What MuJoCo's ray caster sees from straight above: the reference of `dipn_jax.render`.
+    """What MuJoCo's ray caster sees from straight above: the reference of `dipn_jax.sight.render`.
 
     Args:
       scenes: `[B, N, ...]`.

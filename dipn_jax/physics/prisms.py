@@ -21,9 +21,9 @@ from mujoco.mjx._src import collision_convex, collision_driver, math, mesh
 from mujoco.mjx._src.collision_types import ConvexInfo, GeomInfo
 from mujoco.mjx._src.types import ConvexMesh, GeomType
 
-from dipn_jax import shapes
-from dipn_jax.shapes import CORNERS, CORNERS_USED, SIDES, UNIT_VERTICES
 from dipn_jax.structs import Pytree
+from dipn_jax.world import shapes
+from dipn_jax.world.shapes import CORNERS, CORNERS_USED, SIDES, UNIT_VERTICES
 
 CONTACTS = 4
 """Contacts a pair of geoms can have."""

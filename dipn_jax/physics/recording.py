@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from dipn_jax import physics
-from dipn_jax.model import GRIPPER_DOF
 from dipn_jax.physics import faults
 from dipn_jax.structs import Array, Pytree, Scene, Trajectory
+from dipn_jax.world.model import GRIPPER_DOF
 
 
 @flax.struct.dataclass

@@ -17,12 +17,14 @@ import jax
 import mujoco
 import numpy as np
 
-from dipn_jax import model, physics, shapes
+from dipn_jax import physics
+from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.errors import UserError
-from dipn_jax.model import GRIPPER_DOF, PhysicsConfig
 from dipn_jax.physics import hosted
-from dipn_jax.scenes import parked
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
+from dipn_jax.world import model, shapes
+from dipn_jax.world.model import GRIPPER_DOF
+from dipn_jax.world.scenes import parked
 
 DEFAULTS = PhysicsConfig()
 CONTACTS, PAIRS, ROWS = 24, 12, 72
@@ -51,7 +53,7 @@ def _load() -> tuple[Any, Any]:
 
 
 class WarpEngine:
-    """See `physics.Engine`."""
+    """See `Engine`."""
 
     name = "warp"
 
@@ -81,7 +83,7 @@ class WarpEngine:
         settle: bool = False,
         fence: float = 0.0,
     ) -> Rollout:
-        """See `physics.Engine.simulate`; numpy arrays out."""
+        """See `Engine.simulate`; numpy arrays out."""
         args = jax.tree.map(np.asarray, (scenes, poses, trajectories))
         done = []
         for start in range(0, len(args[1]), self.chunk):
@@ -91,7 +93,7 @@ class WarpEngine:
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *done)
 
     def stop(self) -> None:
-        """See `physics.Engine.stop`."""
+        """See `Engine.stop`."""
         self.stopped.set()
 
     def _simulate(
@@ -155,7 +157,7 @@ class _Worlds:
     def advance(self) -> tuple[np.ndarray, np.ndarray]:
         """See `hosted.Worlds`; no world is given up."""
         if self.engine.stopped.is_set():
-            raise physics.Stopped
+            raise Stopped
         self.data.ctrl.assign(self.ctrl.astype(np.float32))
         self.data.qfrc_applied.assign(self.qfrc_applied.astype(np.float32))
         if self.graph is not None:

@@ -5,10 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
+from dipn_jax.datagen.generate import Job, generate
 
-from datagen.generate import Job, generate
-from dipn_jax import records, scenes, structs
+from dipn_jax import structs
 from dipn_jax.errors import UserError
+from dipn_jax.storage import records
+from dipn_jax.world import scenes
 
 JOB = Job("push", scenes.fixed_count(3, spread=0.2), 24, 0, 16, 4, "native", None)
 

@@ -7,10 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from dipn_jax.datagen import check, episodes, isolated, world
 
-from datagen import check, episodes, isolated, world
-from dipn_jax import files, geometry, shapes
+from dipn_jax import files, geometry
 from dipn_jax.errors import UserError
+from dipn_jax.world import shapes
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
 

@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import candidates, geometry, render, structs
+from dipn_jax import geometry, structs
+from dipn_jax.planning import candidates
+from dipn_jax.sight import fingers, masks, render
 from dipn_jax.structs import ABSENT, Observation
 from dipn_jax.workspace import GRIPPER
 
@@ -18,12 +20,12 @@ def _seen(settled: Any, index: int = 0) -> Observation:
 def test_contour_is_opencvs(settled: Any) -> None:
     mask = np.asarray(_seen(settled).label) != ABSENT
     eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    np.testing.assert_array_equal(candidates.contour(jnp.array(mask)), mask & (eroded == 0))
+    np.testing.assert_array_equal(masks.contour(jnp.array(mask)), mask & (eroded == 0))
 
 
 def test_centroids_are_opencvs(settled: Any) -> None:
     label = np.asarray(_seen(settled).label)
-    centers, area = candidates.mask_centers(jnp.array(label), 5)
+    centers, area = masks.mask_centers(jnp.array(label), 5)
     for i in range(5):
         moments = cv2.moments((label == i).astype(np.uint8), binaryImage=True)
         assert area[i] == moments["m00"]
@@ -128,14 +130,12 @@ def test_grasps_like_one_that_missed_are_doubted() -> None:
 
 def test_a_push_can_begin_where_the_footprint_is_free(settled: Any) -> None:
     seen = _seen(settled)
-    possible = np.asarray(candidates.pushable(seen.height))
+    possible = np.asarray(fingers.pushable(seen.height))
     assert possible.shape == (16, 224, 224) and not possible[:, :10].any() and not possible[:, :, 215:].any()
     rng = np.random.default_rng(0)
     index = np.stack([rng.integers(16, size=400), rng.integers(20, 204, 400), rng.integers(20, 204, 400)], -1)
     pushes = jax.vmap(candidates.push_at, in_axes=(0, None))(index, 0.1)
-    free = np.asarray(
-        jax.vmap(candidates.footprint_free, in_axes=(None, 0, 0))(seen.height, pushes.start, pushes.angle)
-    )
+    free = np.asarray(jax.vmap(fingers.footprint_free, in_axes=(None, 0, 0))(seen.height, pushes.start, pushes.angle))
     at = possible[tuple(index.T)]
     assert 0.3 < free.mean() < 0.98
     assert (at == free).mean() > 0.97, "they differ only within a pixel of an object"
@@ -177,7 +177,7 @@ def test_what_fingers_come_down_on_is_where_the_simulated_fingers_are(settled: A
     height = np.asarray(render.render(structs.take(settled.scene, 0), settled.poses[0]).height)
     center = rng.uniform(-0.1, 0.1, (30, 2)).astype(np.float32)
     angle = rng.uniform(0, 2 * np.pi, 30).astype(np.float32)
-    found = np.asarray(candidates.under_fingers(jnp.asarray(height), jnp.asarray(center), jnp.asarray(angle)))
+    found = np.asarray(fingers.under_fingers(jnp.asarray(height), jnp.asarray(center), jnp.asarray(angle)))
     row, col = np.indices(height.shape)
     xy = (np.stack([col, row], -1) - 111.5) * 0.002
     near, far, half = GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness, GRIPPER.pad_width / 2

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint, files
+from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.storage import checkpoint
 
 CONFIG = GraspConfig(width=8)
 BUILTIN = pathlib.Path("builtin")

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from dipn_jax import codec
+from dipn_jax.storage import codec
 
 
 def _columns(rng: np.random.Generator, *, push: bool) -> codec.Columns:

@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import candidates, geometry, imagine, losses, render, structs
+from dipn_jax import geometry, structs
+from dipn_jax.networks import losses
+from dipn_jax.sight import imagine, masks, render
 from dipn_jax.structs import ABSENT
 
 
@@ -16,7 +18,7 @@ def _seen(settled: Any, index: int) -> Any:
 
 def test_no_motion_is_the_same_image(settled: Any) -> None:
     _, seen = _seen(settled, 0)
-    centers, _ = candidates.mask_centers(seen.label, 5)
+    centers, _ = masks.mask_centers(seen.label, 5)
     same = imagine.imagine(seen, centers, jnp.zeros((5, 3)))
     np.testing.assert_array_equal(same.label, seen.label)
     np.testing.assert_allclose(same.height, seen.height, atol=1e-7)
@@ -29,7 +31,7 @@ def test_a_moved_image_is_the_render_of_the_moved_scene(settled: Any, angle: flo
     scene, seen = _seen(settled, 1)
     only = scene.replace(shape=np.where(np.arange(5) == 0, scene.shape, ABSENT))
     seen = render.render(only, settled.poses[1])
-    centers, _ = candidates.mask_centers(seen.label, 5)
+    centers, _ = masks.mask_centers(seen.label, 5)
     before = jnp.asarray(settled.poses[1])
     middle = geometry.transform_poses(before, 0.0, -before[0, :2])
     after = geometry.transform_poses(middle, angle, jnp.array([0.02, -0.01]))
@@ -42,7 +44,7 @@ def test_a_moved_image_is_the_render_of_the_moved_scene(settled: Any, angle: flo
 
 def test_the_moved_mask_is_opencvs_warp(settled: Any) -> None:
     _, seen = _seen(settled, 2)
-    centers, _ = candidates.mask_centers(seen.label, 5)
+    centers, _ = masks.mask_centers(seen.label, 5)
     motion = np.zeros((5, 3), np.float32)
     motion[0] = [0.03, 0.01, 0.5]
     mask = (np.asarray(seen.label) == 0).astype(np.uint8)
@@ -61,7 +63,7 @@ def test_the_higher_object_hides_the_lower() -> None:
     from dipn_jax.structs import Observation
 
     seen = Observation(height, jnp.zeros((224, 224, 3)), label)
-    centers, _ = candidates.mask_centers(label, 2)
+    centers, _ = masks.mask_centers(label, 2)
     onto = jnp.array([[0.08, 0.0, 0.0], [0.0, 0.0, 0.0]])
     after = imagine.imagine(seen, centers, onto)
     assert (after.label == 1).sum() == 100 and (after.label == 0).sum() == 0

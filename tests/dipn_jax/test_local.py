@@ -8,8 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import checkpoint, clutter, planner, policy, structs
+from dipn_jax import structs
 from dipn_jax.networks import local
+from dipn_jax.planning import planner, policy
+from dipn_jax.sight import render
+from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Decision, Observation
 
 COUNT, SLOTS = 32, 5
@@ -34,7 +37,7 @@ def scores() -> dict[str, Any]:
 
 
 def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled: Any, scores: dict[str, Any]) -> None:
-    seen = clutter.observe(settled.scene, settled.poses)
+    seen = render.observe(settled.scene, settled.poses)
     many = 0
     for i in range(6):
         table = structs.take(seen, i)
@@ -48,7 +51,7 @@ def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled
 
 
 def test_rough_means_rank_nearly_as_whole_images_do(settled: Any, scores: dict[str, Any]) -> None:
-    seen = clutter.observe(settled.scene, settled.poses)
+    seen = render.observe(settled.scene, settled.poses)
     image = np.asarray(jax.vmap(planner.render.rgbd)(seen))
     now = image[0]
     others = np.repeat(now[None], 8, 0)

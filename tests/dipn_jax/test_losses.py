@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import losses
+from dipn_jax.networks import losses
 
 
 def test_motion_loss_is_numpys(rng: np.random.Generator) -> None:

@@ -15,13 +15,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from dipn_jax import geometry, model, primitives, scenes, shapes
+from dipn_jax import geometry
 from dipn_jax.errors import UserError
 from dipn_jax.physics import mjx, prisms
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.native import NativeEngine
 from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
+from dipn_jax.world import model, primitives, scenes, shapes
 
 BATCH, SLOTS = 4, 3
 POSITION_TOLERANCE = 0.003
@@ -49,7 +50,8 @@ LINES = (
 
 DEVICES = """
 import jax, numpy as np
-from dipn_jax import console, primitives, scenes
+from dipn_jax import console
+from dipn_jax.world import primitives, scenes
 from dipn_jax.physics.mjx import MjxEngine
 console.enable_compilation_cache()
 assert jax.device_count() == 4

@@ -7,13 +7,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from dipn_jax.datagen import isolated
 
-from datagen import isolated
-from dipn_jax import clutter, model, physics, primitives, scenes, shapes, structs
+from dipn_jax import physics, structs
+from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.errors import UserError
 from dipn_jax.physics import native
 from dipn_jax.structs import Fault, Grasp, Push, Scene
 from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import clutter, model, primitives, scenes, shapes
 
 
 def one_of_each(slots: int = 2) -> tuple[Scene, np.ndarray]:
@@ -179,7 +181,7 @@ def test_lack_of_room_is_a_fault(engine: Any, resting: Any, monkeypatch: pytest.
 
 def test_a_diverged_simulation_is_not_reset_behind_our_back(resting: Any) -> None:
     scene, _ = resting
-    text = model.mjcf(structs.take(scene, 0), config=model.PhysicsConfig())
+    text = model.mjcf(structs.take(scene, 0), config=PhysicsConfig())
     spec = mujoco.MjModel.from_xml_string(text)
     assert spec.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
 
@@ -253,7 +255,7 @@ def test_a_stopped_engine_stops(resting: Any) -> None:
     scene, poses = resting
     engine = native.NativeEngine()
     engine.stop()
-    with pytest.raises(physics.Stopped):
+    with pytest.raises(Stopped):
         primitives.settle(engine, scene, poses)
 
 

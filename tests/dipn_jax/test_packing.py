@@ -4,9 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from dipn_jax import geometry, packing, scenes
+from dipn_jax import geometry
 from dipn_jax.errors import UserError
-from dipn_jax.scenes import Ranges
+from dipn_jax.world import packing, scenes
+from dipn_jax.world.scenes import Ranges
 
 PACKED = scenes.parse_objects("6", ranges=Ranges(packed=1.0))
 

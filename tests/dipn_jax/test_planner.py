@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax import candidates, planner, policy, render, structs
+from dipn_jax import structs
+from dipn_jax.planning import candidates, planner, policy
+from dipn_jax.sight import fingers, masks, render
 from dipn_jax.structs import Observation, Push
 
 SLOTS, COUNT = 5, 8
@@ -25,7 +27,7 @@ def bare(images: jax.Array) -> jax.Array:
 
 def stack_for_the_third(observation: Observation, pushes: Push) -> jax.Array:
     """With the third candidate every object ends in the middle, on top of one another: less is covered."""
-    centers, _ = candidates.mask_centers(observation.label, SLOTS)
+    centers, _ = masks.mask_centers(observation.label, SLOTS)
     still = jnp.zeros((COUNT, SLOTS, 3))
     return still.at[2, :, :2].set(-centers)
 
@@ -127,7 +129,7 @@ def test_the_better_of_two_values_is_done(seen: Observation) -> None:
     options = {"slots": SLOTS, "distance": 0.1}
     decision = planner.compare(seen, valued(0.7), valued(0.5), **options)
     assert decision.is_push and decision.push.distance == np.float32(0.1)
-    possible = candidates.pushable(seen.height)
+    possible = fingers.pushable(seen.height)
     assert possible[tuple(candidates.push_index(decision.push))]
     assert not planner.compare(seen, valued(0.7), valued(0.5), threshold=0.4, **options).is_push
     assert not planner.compare(seen, valued(0.4), valued(0.5), **options).is_push

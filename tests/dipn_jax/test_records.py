@@ -5,8 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from dipn_jax import files, records
+from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.storage import records
 
 
 @pytest.fixture

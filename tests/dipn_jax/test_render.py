@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import geometry, render, structs
+from dipn_jax import geometry, structs
 from dipn_jax.physics import native
+from dipn_jax.sight import render
 from dipn_jax.structs import ABSENT
 
 

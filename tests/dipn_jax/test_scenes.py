@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from dipn_jax import cases, scenes, shapes
 from dipn_jax.errors import UserError
+from dipn_jax.world import cases, scenes, shapes
 
 CONFIG = scenes.fixed_count(5)
 

@@ -5,8 +5,8 @@ import jax
 import numpy as np
 import pytest
 
-from dipn_jax import clutter, segment
 from dipn_jax.errors import UserError
+from dipn_jax.sight import render, segment
 from dipn_jax.structs import ABSENT, Observation
 
 SLOTS = 5
@@ -14,7 +14,7 @@ SLOTS = 5
 
 @pytest.fixture(scope="module")
 def seen(settled: Any) -> Observation:
-    return jax.tree.map(np.asarray, clutter.observe(settled.scene, settled.poses))
+    return jax.tree.map(np.asarray, render.observe(settled.scene, settled.poses))
 
 
 def _ious(found: np.ndarray, true: np.ndarray) -> list[float]:

@@ -3,7 +3,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dipn_jax import shapes
+from dipn_jax.world import shapes
 
 SIZE = np.array([0.1, 0.05, 0.04])
 

@@ -3,14 +3,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import candidates, render, structs
+from dipn_jax import structs
 from dipn_jax.networks import push_frame, stepwise
+from dipn_jax.sight import masks, render
 from dipn_jax.workspace import GRIPPER
 
 
 def test_outlines_are_how_far_the_pixels_reach(settled: Any) -> None:
     height, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
-    centers, _ = candidates.mask_centers(label, 5)
+    centers, _ = masks.mask_centers(label, 5)
     got = np.asarray(push_frame.outlines(label, height, jnp.float32(0.4), centers))
     at = (np.arange(224) - 111.5) * 0.002
     c, s = np.cos(0.4), np.sin(0.4)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from dipn_jax import checkpoint, policy
 from dipn_jax.errors import UserError
 from dipn_jax.networks import vpg
 from dipn_jax.networks.vpg import VpgConfig
+from dipn_jax.planning import policy
+from dipn_jax.storage import checkpoint
 
 
 def _parameters(model: nnx.Module) -> int:

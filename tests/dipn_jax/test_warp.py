@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dipn_jax import physics, primitives, structs
+from dipn_jax import physics, structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import warp
 from dipn_jax.structs import Fault
 from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import primitives
 
 
 def test_without_its_packages_it_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,15 +7,19 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from dipn_jax.eval import metrics
+from dipn_jax.eval.clearing import command, instances, lockstep, methods, sweeping
+from dipn_jax.eval.clearing.instances import Instance, Tables
 from flax import nnx
 
-from dipn_jax import cases, checkpoint, planner, scenes, structs
+from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
-from eval import clearing, clearing_cli, deciding, instances, metrics, sweeping
-from eval.instances import Instance, Tables
+from dipn_jax.planning import planner
+from dipn_jax.storage import checkpoint
+from dipn_jax.world import cases, scenes
 
 CONFIGS: dict[str, tuple[str, Any]] = {
     "push": ("dipn", DipnConfig(width=8)),
@@ -36,19 +40,19 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
     return {name: folder / name for name in CONFIGS}
 
 
-def _nets(runs: dict[str, pathlib.Path]) -> deciding.Nets:
-    return deciding.Nets(runs["push"], runs["grasp"], runs["value"])
+def _nets(runs: dict[str, pathlib.Path]) -> methods.Nets:
+    return methods.Nets(runs["push"], runs["grasp"], runs["value"])
 
 
 @pytest.mark.parametrize("method", ["rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"])
 def test_every_method_decides_on_every_table_by_itself(
     method: Any, engine: Any, settled: Any, runs: dict[str, pathlib.Path]
 ) -> None:
-    plan = deciding.Plan(method, candidates=3, threshold=0.9, gamma=1.2)
+    plan = methods.Plan(method, candidates=3, threshold=0.9, gamma=1.2)
     nets = _nets(runs)
     if method == "rea+dipn":
         nets = dataclasses.replace(nets, value=runs["chances"])
-    decide = deciding.load(plan, nets, engine, slots=5)
+    decide = methods.load(plan, nets, engine, slots=5)
     keys = jax.random.split(jax.random.key(0), 3)
     scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]
     none = np.tile(planner.NONE_MISSED, (3, 4, 1))
@@ -61,9 +65,9 @@ def test_every_method_decides_on_every_table_by_itself(
     assert (doubting.values[:, 0] < together.values[:, 0]).all() and (doubting.grasp_pixel != missed[:, -1]).any()
     if method == "gn":
         assert not together.is_push.any()
-        forgetful = deciding.load(dataclasses.replace(plan, remember=False), nets, engine, slots=5)
+        forgetful = methods.load(dataclasses.replace(plan, remember=False), nets, engine, slots=5)
         np.testing.assert_array_equal(forgetful(keys, scene, poses, missed).grasp_pixel, together.grasp_pixel)
-        rash = deciding.load(dataclasses.replace(plan, cautious=False), nets, engine, slots=5)
+        rash = methods.load(dataclasses.replace(plan, cautious=False), nets, engine, slots=5)
         assert (rash(keys, scene, poses, none).values[:, 0] > together.values[:, 0]).all()
     if method == "physics+gn":
         assert np.abs(together.motion).max() > 0.01, "the engine was not asked, or moved nothing"
@@ -80,35 +84,35 @@ def test_a_miss_is_kept_in_mind_until_something_near_it_moves(settled: Any) -> N
         made.poses = made.poses.copy()
         made.poses[moved[0], 0] += moved[1]
         made.did.append(did)
-        clearing._doubt(made, before, np.array(pixel, np.int32))
-        return int((clearing._missed(made)[:, 0] >= 0).sum())
+        lockstep._doubt(made, before, np.array(pixel, np.int32))
+        return int((lockstep._missed(made)[:, 0] >= 0).sum())
 
     assert act("grasp missed", (3, 112, 112)) == 1
     assert act("grasp missed", (3, 112, 162)) == 2  # at the second object
     assert act("push", moved=(3, 0.05)) == 2  # 10 cm away from both
     assert act("grasp held", moved=(1, 0.006)) == 1
-    np.testing.assert_array_equal(clearing._missed(made)[0], [3, 112, 112])
+    np.testing.assert_array_equal(lockstep._missed(made)[0], [3, 112, 112])
     assert act("grasp missed", (5, 112, 112), moved=(0, 0.02)) == 0, "it moved what it missed"
-    assert [act("grasp missed", (i, 112, 112)) for i in range(10)][-1] == clearing.MISSES
+    assert [act("grasp missed", (i, 112, 112)) for i in range(10)][-1] == lockstep.MISSES
 
 
 def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pathlib.Path]) -> None:
     for method, net in (("dipn+gn", "push"), ("vpg", "value"), ("physics+gn", "grasp")):
         with pytest.raises(UserError, match=f"--method {method.replace('+', '.')}: wants --{net}-net"):
-            deciding.load(deciding.Plan(method), deciding.Nets(), engine, slots=5)  # type: ignore[arg-type]
-    grasps_only = deciding.Nets(None, runs["grasp"], runs["only"])
+            methods.load(methods.Plan(method), methods.Nets(), engine, slots=5)  # type: ignore[arg-type]
+    grasps_only = methods.Nets(None, runs["grasp"], runs["only"])
     with pytest.raises(UserError, match="has not learnt to push"):
-        deciding.load(deciding.Plan("dqn+gn"), grasps_only, engine, slots=5)
+        methods.load(methods.Plan("dqn+gn"), grasps_only, engine, slots=5)
     with pytest.raises(UserError, match="has learnt values, not chances"):
-        deciding.load(deciding.Plan("rea+dipn"), _nets(runs), engine, slots=5)
+        methods.load(methods.Plan("rea+dipn"), _nets(runs), engine, slots=5)
     with pytest.raises(UserError, match="holds a grasp network, want vpg"):
-        deciding.load(deciding.Plan("vpg"), deciding.Nets(value=runs["grasp"]), engine, slots=5)
+        methods.load(methods.Plan("vpg"), methods.Nets(value=runs["grasp"]), engine, slots=5)
     with pytest.raises(UserError, match="--method search"):
-        deciding.Plan("search")  # type: ignore[arg-type]
+        methods.Plan("search")  # type: ignore[arg-type]
 
 
 def test_of_several_distances_candidates_take_one_each() -> None:
-    plan = deciding.Plan(candidates=5, distances=(0.03, 0.06))
+    plan = methods.Plan(candidates=5, distances=(0.03, 0.06))
     np.testing.assert_allclose(plan.spread(), [0.03, 0.06, 0.03, 0.06, 0.03])
 
 
@@ -142,7 +146,7 @@ def test_a_repeat_of_a_case_is_the_same_however_many_others_there_are(engine: An
 def test_a_sweep_has_a_candidate_for_every_distance(tmp_path: pathlib.Path) -> None:
     builtin = pathlib.Path("builtin")
     with pytest.raises(UserError, match="--candidates 1: want at least one for each of the 2 distances"):
-        clearing_cli.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), candidates=1)
+        command.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), candidates=1)
 
 
 def test_distances_are_parsed_and_nonsense_is_refused() -> None:
@@ -166,9 +170,9 @@ def test_a_sweep_goes_on_at_the_distance_where_it_was_stopped(
 
     def sweep(seed: int) -> None:
         builtin = pathlib.Path("builtin")
-        clearing_cli.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), pushes=0, seed=seed)
+        command.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), pushes=0, seed=seed)
 
-    monkeypatch.setattr(clearing_cli, "_cleared", clear)
+    monkeypatch.setattr(command, "_cleared", clear)
     with pytest.raises(KeyboardInterrupt):
         sweep(1)
     sweep(1)
@@ -177,7 +181,7 @@ def test_a_sweep_goes_on_at_the_distance_where_it_was_stopped(
 
 
 def test_a_longer_push_is_harder_to_foresee(engine: Any) -> None:
-    from dipn_jax import policy
+    from dipn_jax.planning import policy
 
     config = scenes.fixed_count(3, spread=0.2)
     values = sweeping.prediction_errors(

@@ -6,12 +6,12 @@ import pathlib
 
 import numpy as np
 import pytest
+from dipn_jax.eval.prediction import curve
 from flax import nnx
 
-from dipn_jax import checkpoint
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
-from eval import curve
+from dipn_jax.storage import checkpoint
 
 DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"
 

@@ -8,15 +8,23 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from dipn_jax.eval import metrics
+from dipn_jax.eval.clearing import film, instances, lockstep, methods
+from dipn_jax.eval.grasping import success
+from dipn_jax.eval.prediction import push_errors
+from dipn_jax.eval.report import comparison, page
 from flax import nnx
 
-from dipn_jax import candidates, cases, checkpoint, clutter, policy, primitives, render, scenes, structs
+from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.resume import Partial
+from dipn_jax.planning import candidates, policy
+from dipn_jax.sight import render
+from dipn_jax.storage import checkpoint
+from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import Push, Scene
-from eval import clearing, comparison, deciding, film, grasping, instances, metrics, prediction, report
+from dipn_jax.world import cases, clutter, primitives, scenes
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
@@ -43,8 +51,8 @@ def test_interval_holds_the_ratio(rng: np.random.Generator) -> None:
 
 
 def test_calibration_error_of_known_scores() -> None:
-    for success, error in ((1, 0.05), (0, 0.95)):
-        found = grasping.calibration(np.full(10, 0.95), np.full(10, success))
+    for held, error in ((1, 0.05), (0, 0.95)):
+        found = success.calibration(np.full(10, 0.95), np.full(10, held))
         assert found["expected_calibration_error"] == pytest.approx(error)
         assert found["reliability/9/count"] == 10 and found["reliability/9/success"] == success
 
@@ -63,7 +71,7 @@ def test_summary_counts_as_the_paper_does() -> None:
         _ended("cleared", ["push", "grasp held", "grasp missed", "grasp held"], 2, 2),
         _ended("pushed out", ["grasp held", "push"], 1, 3),
     ]
-    values = clearing.summary(rows)
+    values = lockstep.summary(rows)
     assert values["completion"] == 0.5
     assert values["grasp_success_all"] == 3 / 4 and values["grasp_success_completed"] == 2 / 3
     assert values["efficiency_all"] == 3 / 6 and values["efficiency_completed"] == 2 / 4
@@ -92,7 +100,7 @@ def test_prediction_measures_the_baselines_as_they_are(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
     network = {"dipn": checkpoint.load_network(runs["dipn"], network="dipn")}
-    values, films = prediction.evaluate(
+    values, films = push_errors.evaluate(
         network, engine, CONFIG, Partial(tmp_path, {}), scenes=6, seed=3, physics=True, segmented=True
     )
     assert values["pushes"] == 6 and len(films["before"]) > 0
@@ -104,14 +112,14 @@ def test_prediction_measures_the_baselines_as_they_are(
 
 
 def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> None:
-    seen = jax.tree.map(np.asarray, clutter.observe(settled.scene, settled.poses))
+    seen = jax.tree.map(np.asarray, render.observe(settled.scene, settled.poses))
     truth = np.repeat(settled.poses[:, None], 3, 1)
     truth[:, 1:, 0, 0] += 0.01
-    after = prediction._labels_after(settled.scene, truth)
+    after = push_errors._labels_after(settled.scene, truth)
     pushes = Push(np.zeros((6, 2), np.float32), np.zeros(6, np.float32), np.full(6, 0.05, np.float32))
-    rows: prediction.Rows = {}
-    static = {"static": prediction._at_distances(policy.static_predictor(5))}
-    prediction.measure(rows, "", static, seen, seen, pushes, truth, after, None)
+    rows: push_errors.Rows = {}
+    static = {"static": push_errors._at_distances(policy.static_predictor(5))}
+    push_errors.measure(rows, "", static, seen, seen, pushes, truth, after, None)
     for b in range(6):
         for i in range(5):
             was, is_ = seen.label[b] == i, after[b, 0] == i
@@ -125,7 +133,7 @@ def test_grasp_evaluation_writes_what_it_promises(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
     scorer = policy.load_scorer(runs["grasp"])
-    values, tables = grasping.evaluate(scorer, engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3, others=2)
+    values, tables = success.evaluate(scorer, engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3, others=2)
     assert values["attempts"] == sum(table.grasps for table in tables) >= 3 and values["scenes"] == 3
     assert sum(value for key, value in values.items() if key.startswith("table/")) == 3
     assert 0 <= values["other_grasps/ceiling"] <= 1
@@ -134,7 +142,7 @@ def test_grasp_evaluation_writes_what_it_promises(
 
 
 def test_labels_of_pretraining_mostly_say_what_physics_says(engine: Any) -> None:
-    found = grasping.label_agreement(engine, scenes.fixed_count(1), scenes=16, seed=0)
+    found = success.label_agreement(engine, scenes.fixed_count(1), scenes=16, seed=0)
     assert found["grasps"] > 48 and 0.1 < found["positive"] < 0.9
     assert found["agree"] > 0.7
 
@@ -143,15 +151,15 @@ def test_labels_of_pretraining_mostly_say_what_physics_says(engine: Any) -> None
 def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Two hard cases acted on by networks that know nothing: one by grasps, one by pushes."""
     out = tmp_path_factory.mktemp("clear")
-    nets = deciding.Nets(push=runs["dipn"], grasp=runs["grasp"])
+    nets = methods.Nets(push=runs["dipn"], grasp=runs["grasp"])
 
     def table(name: str) -> list[instances.Instance]:
         return instances.hard_instances(engine, cases.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
 
-    grasps = deciding.load(deciding.Plan(candidates=4, threshold=0.0), nets, engine, slots=6)
-    grasped = clearing.clear(table("06"), engine, grasps, Partial(out, {"case": "06"}), seed=0)
+    grasps = methods.load(methods.Plan(candidates=4, threshold=0.0), nets, engine, slots=6)
+    grasped = lockstep.clear(table("06"), engine, grasps, Partial(out, {"case": "06"}), seed=0)
     tables = table("10")
-    decide = deciding.load(deciding.Plan(candidates=4, threshold=2.0, gamma=1.05), nets, engine, slots=6)
+    decide = methods.load(methods.Plan(candidates=4, threshold=2.0, gamma=1.05), nets, engine, slots=6)
     # interrupted after the second turn, then taken up by a fresh call
     partial = Partial(out, {})
     save = partial.save
@@ -163,13 +171,13 @@ def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest
 
     partial.save = stop_at_two  # type: ignore[method-assign]
     with pytest.raises(KeyboardInterrupt):
-        clearing.clear(copy.deepcopy(tables), engine, decide, partial, seed=0)
-    tables = clearing.clear(tables, engine, decide, Partial(out, {}), seed=0)
+        lockstep.clear(copy.deepcopy(tables), engine, decide, partial, seed=0)
+    tables = lockstep.clear(tables, engine, decide, Partial(out, {}), seed=0)
     assert Partial(out, {"other": 1}).load("fresh") == "fresh"
     tables = grasped + tables
-    clearing.save(tables, out)
+    lockstep.save(tables, out)
     settings = {"method": "dipn+gn", "label": "", "tables.cases": "hard", "tables.objects": "10"}
-    metrics.write(out, clearing.summary(tables), settings=settings)
+    metrics.write(out, lockstep.summary(tables), settings=settings)
     return tables, out
 
 
@@ -227,7 +235,7 @@ def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib
 def test_learning_curves_show_whatever_lines_have(tmp_path: pathlib.Path) -> None:
     lines = [{"step": 10, "reward/grasp": 0.5}, {"step": 20, "reward/push": 0.25}, {"step": 30, "reward/grasp": 0.75}]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    drawn = {line.get_label(): line.get_xydata().tolist() for line in report._curves([tmp_path]).axes[0].lines}
+    drawn = {line.get_label(): line.get_xydata().tolist() for line in page._curves([tmp_path]).axes[0].lines}
     assert drawn == {"reward/grasp": [[10, 0.5], [30, 0.75]], "reward/push": [[20, 0.25]]}
 
 
@@ -246,18 +254,18 @@ def test_the_report_is_one_file_with_its_pictures(
     cleared: Any, engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
     network = {"dipn": checkpoint.load_network(runs["dipn"], network="dipn")}
-    values, films = prediction.evaluate(
+    values, films = push_errors.evaluate(
         network, engine, CONFIG, Partial(tmp_path, {}), scenes=2, seed=3, physics=False, segmented=False
     )
     (tmp_path / "p").mkdir()
     np.savez_compressed(tmp_path / "p" / "films.npz", **films)  # type: ignore[arg-type]
     metrics.write(tmp_path / "p", values, settings={})
     options: dict[str, Any] = {"grasp": None, "clears": [cleared[1]], "sweep": None, "runs": list(runs.values())}
-    merged = report.write(tmp_path, prediction=tmp_path / "p", **options)
-    page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 5
-    assert "74.4" in page, "the paper's numbers stand beside"
-    assert 'src="http' not in page and "href=" not in page
+    merged = page.write(tmp_path, prediction=tmp_path / "p", **options)
+    written = (tmp_path / "report.html").read_text()
+    assert written.count("data:image/png;base64,") == 5
+    assert "74.4" in written, "the paper's numbers stand beside"
+    assert 'src="http' not in written and "href=" not in written
     assert merged["clear/hard/dipn+gn/completion"] == metrics.read(cleared[1])["completion"]
     assert (
         json.loads((tmp_path / "metrics.json").read_text())["push_error/dipn/5cm/all"]

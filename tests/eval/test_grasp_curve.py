@@ -5,9 +5,9 @@ import json
 import pathlib
 
 import pytest
+from dipn_jax.eval.grasping import curve
 
 from dipn_jax.errors import UserError
-from eval import grasp_curve
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
 
@@ -22,12 +22,12 @@ def _run(folder: pathlib.Path, pretrained: bool, success: list[float]) -> pathli
 
 def test_mean_and_band_over_seeds(tmp_path: pathlib.Path) -> None:
     runs = [_run(tmp_path / "a", True, [0.5, 0.9]), _run(tmp_path / "b", True, [0.7, 1.0])]
-    values = grasp_curve.summary(grasp_curve.load([*runs, _run(tmp_path / "c", False, [0.2])]))
+    values = curve.summary(curve.load([*runs, _run(tmp_path / "c", False, [0.2])]))
     assert values["online/with/10/mean"] == pytest.approx(0.6) and values["online/with/20/seeds"] == 2
     assert values["online/with/10/std"] == pytest.approx(0.2 / 2**0.5)
     assert values["online/without/10/std"] == 0 and "online/without/20/mean" not in values
-    assert "| with pre-training | 0.600 ± 0.141 | 0.950 ± 0.071 |" in grasp_curve.table(values, [10, 20])
-    axis = grasp_curve.figure(values).axes[0]
+    assert "| with pre-training | 0.600 ± 0.141 | 0.950 ± 0.071 |" in curve.table(values, [10, 20])
+    axis = curve.figure(values).axes[0]
     assert [text.get_text() for text in axis.get_legend().get_texts()] == [
         "with pre-training, 2 seeds",
         "without pre-training, 1 seeds",
@@ -37,7 +37,7 @@ def test_mean_and_band_over_seeds(tmp_path: pathlib.Path) -> None:
 def test_another_run_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(UserError, match="no run of dipn-train grasp-online"):
-        grasp_curve.load([tmp_path])
+        curve.load([tmp_path])
 
 
 def test_the_page_in_docs_shows_the_figures_in_docs() -> None:

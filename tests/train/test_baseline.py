@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dipn_jax.train import acting, baseline, tables
+from dipn_jax.train.acting import Look
 
-from dipn_jax import checkpoint, policy, resume, scenes, structs
+from dipn_jax import structs
 from dipn_jax.errors import UserError
+from dipn_jax.planning import policy
+from dipn_jax.storage import checkpoint, resume
 from dipn_jax.structs import Grasp, Push
-from train import acting, baseline, tables
-from train.acting import Look
+from dipn_jax.world import scenes
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
@@ -124,11 +127,11 @@ def test_the_published_form_looks_and_learns(engine: Any) -> None:
     import functools
 
     import optax
+    from dipn_jax.train.grasp import PHASE, WINDOWS, Window
+    from dipn_jax.train.loop import make_step
     from flax import nnx
 
     from dipn_jax.networks.vpg import VpgConfig
-    from train.grasp import PHASE, WINDOWS, Window
-    from train.loop import make_step
 
     model = checkpoint.build("vpg", VpgConfig("paper", blocks=(1, 1, 1, 1)))
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
@@ -151,12 +154,12 @@ def test_the_published_form_looks_and_learns(engine: Any) -> None:
 def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
     """A network fits two outcomes that differ in nothing but where they were tried."""
     import optax
+    from dipn_jax.train.grasp import PHASE, WINDOWS, windows
+    from dipn_jax.train.loop import make_step
     from flax import nnx
 
     from dipn_jax.networks.vpg import VpgConfig
     from dipn_jax.structs import GraspEpisode
-    from train.grasp import PHASE, WINDOWS, windows
-    from train.loop import make_step
 
     played = tables.begin(engine, CONFIG, count=2, seed=1)
     center = played.poses[:, 0, :2]

@@ -7,17 +7,21 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from dipn_jax.train import grasp as grasp_task
+from dipn_jax.train import online
+from dipn_jax.train.grasp import PHASE, GraspTask, PretrainTask, view
+from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
+from dipn_jax.train.push import PushTask
 from flax import nnx
 
-from dipn_jax import candidates, checkpoint, clutter, geometry, render, scenes, shapes, structs
+from dipn_jax import geometry, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from train import grasp as grasp_task
-from train import online
-from train.grasp import PHASE, GraspTask, PretrainTask, view
-from train.loop import TrainConfig, fit, make_optimizer, make_step
-from train.push import PushTask
+from dipn_jax.planning import candidates
+from dipn_jax.sight import masks, render
+from dipn_jax.storage import checkpoint
+from dipn_jax.world import scenes, shapes
 
 SMALL = DipnConfig(width=8)
 BRIEF = TrainConfig(steps=6, batch=4, eval_every=3, save_every=3)
@@ -146,7 +150,7 @@ def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Pat
     images, pixel = view(task.fetch(np.arange(6)), begin)
     height = np.asarray(images)[np.arange(6), pixel[:, 0], pixel[:, 1], 3]
     _, row, col = candidates.grasp_index(episodes.grasp).T
-    unturned = np.asarray(clutter.observe(episodes.scene, episodes.poses).height)[np.arange(6), row, col]
+    unturned = np.asarray(render.observe(episodes.scene, episodes.poses).height)[np.arange(6), row, col]
     assert np.median(np.abs(height - unturned)) < 1e-3  # equal up to a pixel of sampling
 
 
@@ -191,7 +195,7 @@ def test_an_example_is_what_the_camera_shows_and_the_push_does(task: PushTask) -
     np.testing.assert_array_equal(kept.target, fresh.target)
     episode = structs.take(task.train_set, 3)
     _, label = render.render_depth(episode.scene, episode.poses[0])
-    centers, area = candidates.mask_centers(label, task.slots)
+    centers, area = masks.mask_centers(label, task.slots)
     c, s = np.cos(episode.push.angle), np.sin(episode.push.angle)
     for k, centimetres in enumerate((5, 10)):
         motion = geometry.planar_motion(episode.poses[0], episode.poses[centimetres], centers)

@@ -1,0 +1,51 @@
+"""Compiled functions over any number of rows, in batches of two fixed sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+BATCH = 64
+"""Rows that compiled functions take at a time."""
+FEW = 16
+"""Rows taken at a time where a row costs much, or where few are left."""
+
+
+def in_chunks(function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)` for any number of rows: BATCH or FEW at a time, so that two compiled shapes serve all.
+
+    Args:
+      function: jitted, of pytrees with a leading axis, each row by itself.
+      args: pytrees with a leading axis.
+
+    Returns:
+      What `function` returns, its rows joined.
+    """
+    count = len(jax.tree.leaves(args)[0])
+    parts, start = [], 0
+    while start < count:
+        size = BATCH if count - start > BATCH - FEW else FEW
+        rows = np.arange(start, start + size) % count
+        parts.append(function(*jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)))
+        start += size
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
+
+
+def in_few(function: Callable[..., Any], *args: Any) -> Any:
+    """As `in_chunks`, FEW at a time, for functions that are dear: `function(*rows, real)` is told which rows count.
+
+    Args:
+      function: jitted, of pytrees with a leading axis, and of `real [FEW]` bool.
+      args: pytrees with a leading axis.
+    """
+    count = len(jax.tree.leaves(args)[0])
+    parts = []
+    for start in range(0, count, FEW):
+        rows = np.arange(start, start + FEW)
+        some = jax.tree.map(lambda leaf, rows=rows % count: leaf[rows], args)
+        parts.append(jax.device_get(function(*some, rows < count)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)

@@ -1,0 +1,82 @@
+"""What a physics engine is: its settings, and the one call that simulates a batch of scenes.
+
+The engines themselves are in `dipn_jax.physics`; whoever simulates is handed one of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal, Protocol
+
+from dipn_jax.structs import Array, Rollout, Scene, Trajectory
+
+EngineName = Literal["auto", "native", "mjx", "warp"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PhysicsConfig:
+    """Solver settings, by measurement: see `docs` of MuJoCo for each option's meaning."""
+
+    timestep: float = 0.002  # seconds
+    iterations: int = 50
+    ls_iterations: int = 50
+    impratio: float = 10.0  # halves the slip of a lifted object
+    cone: str = "elliptic"  # or pyramidal
+    solref: str = "0.01 1"  # softer makes grasps wrong
+    solimp: str = "0.95 0.99 0.001"
+    sleep: float = 0.0  # m/s below which resting objects are left out of a step until something comes (0: never)
+    geom_pairs: tuple[int, int] | None = None  # MJX: pairs kept by the broad phase: at least, and an object
+    contact_points: tuple[int, int] | None = None  # MJX: contacts kept, likewise (None: all)
+
+    def caps(self, slots: int) -> tuple[int, int]:
+        """Pairs and contacts that MJX keeps with `slots` objects; -1: all."""
+        given = (self.geom_pairs, self.contact_points)
+        return tuple(-1 if cap is None else max(cap[0], cap[1] * slots) for cap in given)  # type: ignore[return-value]
+
+
+class Engine(Protocol):
+    """Simulates batches of independent scenes.
+
+    Threads may share one: `native` steps their batches side by side, the others one by one.
+    """
+
+    name: str
+    config: PhysicsConfig
+    batch: int
+    """Scenes it is best given at a time: data sets are made in batches of as many."""
+
+    def simulate(
+        self,
+        scenes: Scene,
+        poses: Array,
+        trajectories: Trajectory,
+        samples: Array,
+        *,
+        settle: bool = False,
+        fence: float = 0.0,
+    ) -> Rollout:
+        """Follow `trajectories` from rest.
+
+        Args:
+          scenes: `[B, N, ...]`.
+          poses: `[B, N, 7]` initial poses; velocities are zero.
+          trajectories: `time [B, K]`, `target [B, K, 5]`; the gripper starts at the first key frame.
+          samples: `[S]` seconds, increasing, common to the batch; the simulation ends at the last.
+          settle: flag episodes in which something still moves at the end.
+          fence: seconds from the start for which objects are kept near the workspace's centre (`fence_force`).
+
+        Returns:
+          Rollout with a leading `[B]`; what went wrong is in `fault [B]`.
+
+        Raises:
+          Stopped: `stop` was called.
+        """
+        ...
+
+    def stop(self) -> None:
+        """From another thread: end `simulate`, now and from now on, as soon as can be."""
+        ...
+
+
+class Stopped(Exception):
+    """An engine was told to stop."""

@@ -1,0 +1,191 @@
+"""Which actions to consider: pushes from the contours of object bundles, grasps at pixels.
+
+Everything runs on the device on a padded number of candidates; nothing is traced out point by point.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from dipn_jax import geometry
+from dipn_jax.sight import fingers, masks
+from dipn_jax.structs import ABSENT, Array, Grasp, Observation, Push
+from dipn_jax.workspace import ROTATIONS, WORKSPACE
+
+STANDOFF = 15
+"""Pixels from the contact back to a push's start. Source: DIPN's released code."""
+CENTER_RANGE = (25, 199)
+"""Pixels: a centre predicted outside drops the push. Source: DIPN's released code."""
+
+CLEARANCE = 0.001  # metres between a fingertip and what it would press on
+GRIP = 0.015  # metres of an object that are between the fingers at least, whatever they press on; of a low one less:
+GIVE = 0.004  # metres by which the tips stop short for it; measured: 5 of 892 grasps threw an object out, 1 with it
+
+ALIKE, ALIKE_TURNS = 10.0, 1  # pixels and rotations by which a grasp differs at most from one that it is like
+
+_OVERSAMPLE = 4
+
+
+@functools.partial(jax.jit, static_argnames=("count", "slots"))
+def sample_pushes(
+    key: jax.Array, observation: Observation, *, count: int, slots: int, distance: Array
+) -> tuple[Push, jax.Array]:
+    """Candidate pushes of one observation.
+
+    Args:
+      key: random key.
+      observation: `[224, 224]` maps.
+      count: number of candidates P.
+      slots: number of object slots N in the labels.
+      distance: metres, traced: one `[]`, or each candidate's own `[P]`.
+
+    Returns:
+      Pushes `[P]` and which of them are feasible `[P]` bool. Feasible ones come first, in random order;
+      where there are fewer than `count`, the rest is flagged.
+    """
+    label, height = observation.label, observation.height
+    on_contour = masks.contour(label != ABSENT).reshape(-1)
+    noise = jax.random.uniform(key, on_contour.shape)
+    _, index = jax.lax.top_k(jnp.where(on_contour, noise, -1.0), _OVERSAMPLE * count)
+    width = label.shape[1]
+    contact = geometry.pixels_to_metres(jnp.stack([index % width, index // width], -1))
+    owner = jnp.maximum(label.reshape(-1)[index], 0)
+    centers, _ = masks.mask_centers(label, slots)
+    toward = centers[owner] - contact
+    angle = jnp.arctan2(toward[:, 1], toward[:, 0])
+    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+    start = contact - STANDOFF * WORKSPACE.pixel * direction
+    pixel = geometry.metres_to_pixels(start)
+    inside = ((pixel >= fingers.START_RANGE[0]) & (pixel <= fingers.START_RANGE[1])).all(-1)
+    free = jax.vmap(fingers.footprint_free, in_axes=(None, 0, 0))(height, start, angle)
+    feasible = on_contour[index] & inside & free
+    chosen = jnp.argsort(~feasible, stable=True)[:count]
+    distances = jnp.broadcast_to(jnp.asarray(distance, jnp.float32), (count,))
+    return Push(start[chosen], angle[chosen], distances), feasible[chosen]
+
+
+def push_at(index: Array, distance: Array) -> Push:
+    """The push that starts at `index [3]` (rotation, row, col) and goes `distance []` metres."""
+    index = jnp.asarray(index)
+    start = geometry.pixels_to_metres(jnp.stack([index[2], index[1]], -1))
+    return Push(start, index[0] * jnp.float32(2 * jnp.pi / ROTATIONS), jnp.float32(distance))
+
+
+def push_index(push: Push) -> jax.Array:
+    """The pixel and direction nearest to a push: `[3]` int32 (rotation, row, col)."""
+    pixel = jnp.round(geometry.metres_to_pixels(push.start))
+    rotation = jnp.round(push.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
+    return jnp.stack([rotation, pixel[1], pixel[0]]).astype(jnp.int32)
+
+
+def stays_inside(centers: jax.Array, area: jax.Array, motion: jax.Array) -> jax.Array:
+    """Whether no visible centre `[N, 2]` (metres) leaves CENTER_RANGE by `motion [N, 3]`."""
+    pixel = geometry.metres_to_pixels(centers + motion[:, :2])
+    before = geometry.metres_to_pixels(centers)
+    low, high = CENTER_RANGE
+    out = ((pixel < low) & (pixel < before)) | ((pixel > high) & (pixel > before))
+    return ~(out.any(-1) & (area > 0)).any()
+
+
+def grasp_at(index: Array, height: jax.Array) -> Grasp:
+    """The grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres).
+
+    The tips go to `grasp_height`, or stop on what a finger meets on its way, as far up as leaves GRIP of the object
+    between them or is GIVE higher.
+    """
+    index = jnp.asarray(index)
+    rotation, row, col = index[..., 0], index[..., 1], index[..., 2]
+    center = geometry.pixels_to_metres(jnp.stack([col, row], -1))
+    angle = rotation * jnp.float32(2 * jnp.pi / ROTATIONS)
+    local = height[row, col]
+    goal, contact = fingers.grasp_height(local), fingers.under_fingers(height, center, angle) + CLEARANCE
+    return Grasp(center, angle, jnp.maximum(goal, jnp.minimum(contact, jnp.maximum(local - GRIP, goal + GIVE))))
+
+
+def grasp_index(grasp: Grasp) -> jax.Array:
+    """Inverse of `grasp_at`: `[..., 3]` int32 (rotation, row, col)."""
+    pixel = jnp.round(geometry.metres_to_pixels(grasp.center))
+    rotation = jnp.round(grasp.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
+    return jnp.stack([rotation, pixel[..., 1], pixel[..., 0]], -1).astype(jnp.int32)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Grasp:
+    """`count` grasps at uniformly random foreground pixels, each at one of the 16 angles."""
+    pixel_key, angle_key = jax.random.split(key)
+    noise = jax.random.uniform(pixel_key, (observation.label.size,))
+    _, pixel = jax.lax.top_k(jnp.where(observation.label.reshape(-1) != ABSENT, noise, -1.0), count)
+    width = observation.label.shape[1]
+    rotation = jax.random.randint(angle_key, (count,), 0, ROTATIONS)
+    return grasp_at(jnp.stack([rotation, pixel // width, pixel % width], -1), observation.height)
+
+
+def sample_grasps(
+    key: jax.Array, observation: Observation, scores: jax.Array, *, count: int, guided: Array, hard: Array
+) -> Grasp:
+    """`count` grasps of what a scorer thinks of: some it believes in, some it is unsure of, the others anywhere.
+
+    Args:
+      key: random key.
+      observation: `[H, W]` maps.
+      scores: `[16, H, W]` in [0, 1].
+      count: number of grasps.
+      guided: share of grasps drawn in proportion to the squared odds of the score, traced.
+      hard: share drawn in proportion to the squared variance, (score x (1 - score))^2, traced.
+    """
+    kind_key, draw_key, random_key = jax.random.split(key, 3)
+    kind = jax.random.uniform(kind_key, (count,))
+    on = jnp.where(observation.label == ABSENT, -jnp.inf, 0.0)
+    yes, no = jnp.log(scores + 1e-6), jnp.log1p(1e-6 - scores)
+
+    def draw(k: jax.Array, u: jax.Array) -> jax.Array:
+        weight = 2 * jnp.where(u < guided, yes - no, yes + no) + on
+        flat = jnp.argmax(weight + jax.random.gumbel(k, weight.shape))
+        return jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
+
+    index = jax.lax.map(lambda pair: draw(*pair), (jax.random.split(draw_key, count), kind))
+    chosen, anywhere = grasp_at(index, observation.height), random_grasps(random_key, observation, count=count)
+
+    def pick(one: jax.Array, other: jax.Array) -> jax.Array:
+        return jnp.where((kind < guided + hard).reshape(-1, *[1] * (one.ndim - 1)), one, other)
+
+    return jax.tree.map(pick, chosen, anywhere)
+
+
+def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The best of scores `[16, H, W]`: index `[3]` (rotation, row, col) and its score."""
+    flat = jnp.argmax(scores)
+    index = jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
+    return index, scores.reshape(-1)[flat]
+
+
+def doubted(scores: jax.Array, missed: Array) -> jax.Array:
+    """Scores `[16, H, W]`, halved near grasps that missed, once for each.
+
+    Args:
+      scores: of grasps, now.
+      missed: `[M, 3]` int32 (rotation, row, col) of grasps that missed on what is there now; -1: none.
+    """
+    missed = jnp.asarray(missed)
+    half = ROTATIONS // 2  # a grasp turned by half a turn is the same grasp
+    turned = jnp.abs((jnp.arange(ROTATIONS)[:, None] - missed[:, 0] + half // 2) % half - half // 2)
+    alike = (turned <= ALIKE_TURNS) & (missed[:, 0] >= 0)
+    away = geometry.view_grid(*scores.shape[1:]) - missed[:, None, None, :0:-1]
+    near = jnp.linalg.norm(away, axis=-1) <= ALIKE
+    count = jnp.einsum("rm,mhw->rhw", alike.astype(scores.dtype), near.astype(scores.dtype))
+    return jnp.minimum(scores, scores * 0.5**count)
+
+
+def best_grasps(scores: jax.Array, *, count: int, apart: float = 8.0) -> jax.Array:
+    """The best of scores `[16, H, W]`, then the best that is `apart` pixels from it, and so on: `[count, 3]`."""
+    grid = geometry.view_grid(*scores.shape[1:])
+
+    def next_best(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        index = best_grasp(left)[0]
+        near = jnp.linalg.norm(grid - index[::-1][:2], axis=-1) < apart
+        return jnp.where(near, -1.0, left), index
+
+    return jax.lax.scan(next_best, scores, None, length=count)[1]

@@ -1,0 +1,149 @@
+"""What a height map alone says of grasps and pushes: what the fingers would come down on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from dipn_jax import geometry
+from dipn_jax.structs import Array
+from dipn_jax.workspace import GRIPPER, ROTATIONS, TURNED_PIXELS, WORKSPACE, grasp_angles
+
+EMPTY_HEIGHT = 0.005
+"""Metres above the table up to which a pixel shows none of an object: no grasp is centred there, and none is learnt."""
+FREE_HEIGHT = 0.01
+"""Metres: what is lower counts as free where a push starts. Source: DIPN's released code."""
+START_RANGE = (10, 214)
+"""Pixels, first and last row and column where a push may start. Source: DIPN's released code."""
+_MARGIN = 0.004  # metres around the closed gripper's footprint
+
+MIN_DEPTH = 0.002
+"""Metres of object that must be between the fingers; objects 25 mm high lie 5 mm over the lowest fingertip."""
+FINGER_COLUMNS = tuple(
+    round(off / WORKSPACE.pixel) for off in (GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness)
+)
+"""Pixels from the middle of a grasp to where a finger begins and ends."""
+BLOCKED_HEIGHT = 0.02
+"""Metres by which something under a finger stands over where its tip is to go: it can rarely push that aside."""
+HIDDEN_WIDTH = 12
+"""Pixels by which an object that reaches the border may extend beyond it, out of sight: half a large one."""
+HIDDEN_HEIGHT = 1.0
+"""Metres: how high such an object is taken to be out of sight."""
+
+
+def grasp_height(local_height: Array) -> jax.Array:
+    """Tip height for a surface `local_height [...]` metres above the table. Source: DIPN's released code."""
+    return jnp.maximum(jnp.asarray(local_height) - 0.04, 0.02)
+
+
+def under_fingers(height: jax.Array, center: jax.Array, angle: jax.Array) -> jax.Array:
+    """The highest point `[...]`, metres, that the open fingers of grasps come down on.
+
+    What reaches the border of the map is taken to go on beyond it.
+
+    Args:
+      height: `[H, W]` metres.
+      center: `[..., 2]` metres.
+      angle: `[...]` radians, of the closing axis.
+    """
+    step = WORKSPACE.pixel / 2
+    off = jnp.arange(GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness + step, step)
+    across = jnp.arange(-GRIPPER.pad_width / 2, GRIPPER.pad_width / 2 + step, step)
+    local = jnp.stack(jnp.meshgrid(jnp.concatenate([-off, off]), across), -1).reshape(-1, 2)
+    at = center[..., None, :] + geometry.rotate2d(local, angle[..., None])
+    pixels = jnp.clip(geometry.metres_to_pixels(at), 0, jnp.array(height.shape[::-1]) - 1)
+    return geometry.sample_nearest(height, pixels).max(-1)
+
+
+def footprint_free(height: jax.Array, start: jax.Array, angle: jax.Array) -> jax.Array:
+    """Whether the closed gripper can come down at `start [2]` (metres), broad side toward `angle []`."""
+    along = jnp.linspace(-0.5, 0.5, 7) * (GRIPPER.pad_width + _MARGIN)
+    across = jnp.linspace(-0.5, 0.5, 13) * (GRIPPER.push_width + _MARGIN)
+    local = jnp.stack(jnp.meshgrid(along, across, indexing="ij"), -1).reshape(-1, 2)
+    pixels = geometry.metres_to_pixels(start + geometry.rotate2d(local, angle))
+    return jnp.all(geometry.sample_nearest(height, pixels, 0.0) < FREE_HEIGHT)
+
+
+def pushable(height: jax.Array) -> jax.Array:
+    """Where the closed gripper can come down, in each direction: `[16, H, W]` bool of a height map `[H, W]`."""
+    size = height.shape[0]
+    rows, cols = (2 * math.ceil(side / 2 / WORKSPACE.pixel) + 1 for side in (GRIPPER.push_width, GRIPPER.pad_width))
+    pixel = jnp.arange(size)
+    near = (pixel >= START_RANGE[0]) & (pixel <= START_RANGE[1])
+
+    def one(angle: jax.Array) -> jax.Array:
+        top = geometry.rotate_map(height, angle, TURNED_PIXELS)
+        for window in ((rows, 1), (1, cols)):
+            top = jax.lax.reduce_window(top, -jnp.inf, jax.lax.max, window, (1, 1), "SAME")
+        return geometry.unrotate_map(top, angle, size)
+
+    half = jax.lax.map(one, jnp.asarray(grasp_angles()[: ROTATIONS // 2]))  # the gripper is its own mirror image
+    return jnp.tile(half < FREE_HEIGHT, (2, 1, 1)) & near[:, None] & near
+
+
+def geometric_labels(height: jax.Array) -> jax.Array:
+    """Which grasps are free of physics' objections, from the height map of a turned view alone.
+
+    A grasp centred on a pixel and closing along its row is positive when there is object between the
+    fingers at the depth they would reach, and none where they come down: a pad's width of rows, and
+    `FINGER_COLUMNS` on each side (DIPN's released code has rows +-4, columns 19 to 28 of its own gripper).
+
+    Args:
+      height: `[H, W]` metres.
+
+    Returns:
+      `[H, W]` float, 1 for positive.
+    """
+    tip = grasp_height(height)
+    return ((height > tip + MIN_DEPTH) & (_under_fingers(height) < tip)).astype(jnp.float32)
+
+
+def _under_fingers(height: jax.Array) -> jax.Array:
+    """The highest point, metres, that the fingers of a grasp centred on each pixel `[H, W]` come down on."""
+
+    def highest(low: int, high: int, half_rows: int) -> jax.Array:
+        rows, cols = 2 * half_rows + 1, high - low + 1
+        pad = ((half_rows, half_rows), (-low if low < 0 else 0, high if high > 0 else 0))
+        top = jnp.pad(height, pad)
+        for window in ((rows, 1), (1, cols)):  # a maximum over a rectangle is one of rows, then one of columns
+            top = jax.lax.reduce_window(top, -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
+        begin = low if low > 0 else 0
+        return top[:, begin : begin + height.shape[1]]
+
+    near, far = FINGER_COLUMNS
+    rows = round(GRIPPER.pad_width / 2 / WORKSPACE.pixel)
+    return jnp.maximum(highest(-far, -near, rows), highest(near, far, rows))
+
+
+def label_image(height: jax.Array) -> jax.Array:
+    """`geometric_labels` of every grasp on a height map `[224, 224]`: `[16, 224, 224]`, as `score_image`."""
+    return _of_every_grasp(height, geometric_labels)
+
+
+def blocked_image(height: jax.Array) -> jax.Array:
+    """Which grasps on a height map `[224, 224]` a finger stops short of: `[16, 224, 224]`, 1 where so, else 0.
+
+    It would come down on something that stands BLOCKED_HEIGHT over where its tip is to go, or out of sight near
+    something that reaches the border.
+    """
+    height = jnp.pad(height, (TURNED_PIXELS - WORKSPACE.pixels) // 2, mode="edge")
+    outside = jnp.abs(jnp.arange(TURNED_PIXELS) - (TURNED_PIXELS - 1) / 2) > WORKSPACE.pixels / 2
+    beyond = jnp.where(outside[:, None] | outside, height, 0.0)
+    hidden = jax.lax.reduce_window(beyond, 0.0, jax.lax.max, (2 * HIDDEN_WIDTH + 1,) * 2, (1, 1), "SAME") > EMPTY_HEIGHT
+    height = jnp.where((outside[:, None] | outside) & hidden, HIDDEN_HEIGHT, height)
+    return _of_every_grasp(
+        height, lambda turned: (_under_fingers(turned) > grasp_height(turned) + BLOCKED_HEIGHT).astype(jnp.float32)
+    )
+
+
+def _of_every_grasp(height: jax.Array, judge: Callable[[jax.Array], jax.Array]) -> jax.Array:
+    """`judge` of turned views, turned back: `[16, 224, 224]`; a grasp turned by half a turn is the same grasp."""
+
+    def one(angle: jax.Array) -> jax.Array:
+        return geometry.unrotate_map(judge(geometry.rotate_map(height, angle, TURNED_PIXELS)), angle, WORKSPACE.pixels)
+
+    half = jax.lax.map(one, jnp.asarray(grasp_angles()[: ROTATIONS // 2]))
+    return jnp.tile(half, (2, 1, 1))

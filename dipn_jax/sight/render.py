@@ -1,0 +1,123 @@
+"""Scene and poses -> what an orthographic camera straight above sees. Pure, batched, without OpenGL.
+
+A vertical ray meets a convex part between its highest lower plane and its lowest upper plane, so a height
+map is a minimum and a maximum of affine functions of the pixel, taken in a window around each object.
+Any other view (turned into a push's frame, a crop around a grasp) is a render of transformed poses.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from dipn_jax import batching, geometry
+from dipn_jax.structs import ABSENT, Array, Observation, Scene
+from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import shapes
+
+WINDOW = 64
+"""Pixels: at 2 mm a pixel it holds any object of diagonal `shapes.MAX_DIAGONAL`."""
+TABLE_COLOR = (0.2, 0.2, 0.2)
+_STEEP = 1e-6  # |n_z| below which a face is taken as vertical
+_FAR = 1e3
+
+
+def _bounds(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Affine bounds on z `[N, P, F, 3]` (constant, x, y), which of them are from above, and which parts there are."""
+    hulls = jax.vmap(shapes.hull)(scene.shape, scene.size)
+    rotation = geometry.quat_to_matrix(poses[:, 3:])
+    with jax.default_matmul_precision("highest"):  # tenths of millimetres, which accelerators else round away
+        normal = jnp.einsum("nij,npfj->npfi", rotation, hulls.normals)
+        offset = hulls.offsets + jnp.einsum("npfi,ni->npf", normal, poses[:, :3])
+    nz = jnp.where(jnp.abs(normal[..., 2]) < _STEEP, _STEEP, normal[..., 2])
+    plane = jnp.stack([offset / nz, -normal[..., 0] / nz, -normal[..., 1] / nz], -1)
+    return plane, nz > 0, hulls.alive
+
+
+def _top(plane: jax.Array, above: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Top of a part over pixels `x [W]`, `y [H]`; `-_FAR` beside it. Planes `[F, 3]`, `[F]`."""
+    top, bottom = jnp.float32(_FAR), jnp.float32(-_FAR)
+    for face in range(plane.shape[0]):
+        height = plane[face, 0] + plane[face, 1] * x[None, :] + plane[face, 2] * y[:, None]
+        top = jnp.where(above[face], jnp.minimum(top, height), top)
+        bottom = jnp.where(above[face], bottom, jnp.maximum(bottom, height))
+    return jnp.where(top >= bottom, top, -_FAR)
+
+
+def _tops(plane: jax.Array, above: jax.Array, alive: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Top of an object, as `_top`; planes `[P, F, 3]`. A missing part costs nothing where scenes are not vmapped."""
+    nothing = jnp.full((y.shape[0], x.shape[0]), -_FAR)
+    best = nothing
+    for part in range(plane.shape[0]):
+        seen = jax.lax.cond(alive[part], lambda p=part: _top(plane[p], above[p], x, y), lambda: nothing)
+        best = jnp.maximum(best, seen)
+    return best
+
+
+@functools.partial(jax.jit, static_argnames=("pixels",))
+def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> tuple[jax.Array, jax.Array]:
+    """Height map and labels of one scene.
+
+    Args:
+      scene: `[N]`.
+      poses: `[N, 7]`, workspace frame.
+      pixels: side of the square view, centred on the workspace, 2 mm a pixel.
+
+    Returns:
+      Height `[pixels, pixels]` in metres (0 on the table) and label `[pixels, pixels]` int32 (ABSENT on the table).
+    """
+    n = scene.shape.shape[0]
+    side = min(WINDOW, pixels)
+    plane, above, alive = _bounds(scene, poses)
+    middle = (pixels - 1) / 2
+    # about the middle of the bounding box, which the centre of mass is not
+    offset = jnp.asarray(shapes.UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(scene.shape, 0)] * scene.size
+    box = poses[:, :3] - jnp.einsum("nij,nj->ni", geometry.quat_to_matrix(poses[:, 3:]), offset)
+    corner = jnp.floor(box[:, :2] / WORKSPACE.pixel + middle - side / 2 + 1).astype(jnp.int32)
+    corner = jnp.clip(jnp.nan_to_num(corner), 0, pixels - side)
+
+    def paint(i: jax.Array, maps: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        height, label = maps
+        col, row = corner[i, 0], corner[i, 1]
+        x = (col + jnp.arange(side) - middle) * WORKSPACE.pixel
+        y = (row + jnp.arange(side) - middle) * WORKSPACE.pixel
+        top = _tops(plane[i], above[i], alive[i], x, y)
+        old_height = jax.lax.dynamic_slice(height, (row, col), (side, side))
+        old_label = jax.lax.dynamic_slice(label, (row, col), (side, side))
+        seen = top > old_height
+        height = jax.lax.dynamic_update_slice(height, jnp.where(seen, top, old_height), (row, col))
+        return height, jax.lax.dynamic_update_slice(label, jnp.where(seen, i, old_label), (row, col))
+
+    start = (jnp.zeros((pixels, pixels)), jnp.full((pixels, pixels), ABSENT, jnp.int32))
+    return jax.lax.fori_loop(0, n, paint, start)
+
+
+@functools.partial(jax.jit, static_argnames=("pixels",))
+def render(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> Observation:
+    """What the camera sees of one scene; arguments as `render_depth`."""
+    height, label = render_depth(scene, poses, pixels=pixels)
+    return Observation(height, paint_labels(label, scene.color), label)
+
+
+def paint_labels(label: jax.Array, color: jax.Array) -> jax.Array:
+    """Colours `[H, W, 3]` of a label map `[H, W]` with object colours `[N, 3]`; the table elsewhere."""
+    palette = jnp.concatenate([color, jnp.array([TABLE_COLOR])])
+    return palette[jnp.where(label == ABSENT, color.shape[0], label)]
+
+
+def rgbd(observation: Observation) -> jax.Array:
+    """The image `[H, W, 4]` that networks see: RGB in [0, 1] and height in metres."""
+    return jnp.concatenate([observation.color, observation.height[..., None]], -1)
+
+
+def observe(scene: Scene, poses: Array) -> Observation:
+    """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
+    return batching.in_chunks(_observe, scene, poses)
+
+
+@jax.jit
+def _observe(scene: Scene, poses: jax.Array) -> Observation:
+    height, label = jax.lax.map(lambda pair: render_depth(*pair), (scene, poses))
+    return Observation(height, jax.vmap(paint_labels)(label, scene.color), label)

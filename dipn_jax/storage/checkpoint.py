@@ -1,0 +1,225 @@
+"""The only owner of checkpoints: Orbax arrays, the config that rebuilds the network, and checksums.
+
+`RUN/checkpoints/STEP/` holds one Orbax folder a part (`model`, `train`) and `meta.json`. Orbax restores
+flipped bits silently and takes an empty step folder for the latest, so every file's SHA-256 is kept and
+reading walks back to the newest step that is whole.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+import shutil
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+from flax import nnx
+
+from dipn_jax import files
+from dipn_jax.errors import UserError
+from dipn_jax.networks import dipn, grasp, vpg
+
+FORMAT_VERSION = 1
+NETWORKS: dict[str, tuple[type, type]] = {
+    "dipn": (dipn.DipnConfig, dipn.DIPN),
+    "grasp": (grasp.GraspConfig, grasp.GraspNet),
+    "vpg": (vpg.VpgConfig, vpg.VPG),
+}
+
+
+def build(name: str, config: Any, *, seed: int = 0) -> nnx.Module:
+    """A freshly initialized network of the given name and config."""
+    return NETWORKS[name][1](config, rngs=nnx.Rngs(seed))
+
+
+def _steps(run: pathlib.Path) -> list[pathlib.Path]:
+    folder = run / "checkpoints"
+    found = [p for p in folder.iterdir() if p.name.isdigit()] if folder.is_dir() else []
+    return sorted(found, key=lambda p: int(p.name), reverse=True)
+
+
+def _flat(tree: Any) -> dict[str, Any]:
+    """Leaves of a pytree by their path."""
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def save(
+    run: pathlib.Path, step: int, parts: dict[str, Any], *, network: str, config: Any, extra: Any, keep: int = 2
+) -> None:
+    """Write one step, atomically, and drop all but the newest `keep`.
+
+    Args:
+      run: the run's folder.
+      step: training step.
+      parts: pytrees of arrays, one Orbax folder each; `model` is what `load_network` reads.
+      network: a key of NETWORKS.
+      config: the network's config dataclass.
+      extra: JSON-able: seed, data fingerprint, position in the data, training config.
+      keep: steps kept.
+    """
+    final = run.resolve() / "checkpoints" / f"{step:08d}"
+    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    checkpointer = ocp.StandardCheckpointer()
+    for name, tree in parts.items():
+        checkpointer.save(temporary / name, _flat(tree))
+    checkpointer.wait_until_finished()
+    for marker in temporary.rglob("commit_success.txt"):  # Orbax writes there where the folder stood
+        marker.write_text("Checkpoint commit was successful\n")
+    stored = sorted(p for p in temporary.rglob("*") if p.is_file())
+    meta = {
+        "format_version": FORMAT_VERSION,
+        "network": network,
+        "network_config": dataclasses.asdict(config),
+        "step": step,
+        "versions": files.package_versions(),
+        "sha256": {str(p.relative_to(temporary)): files.file_sha256(p) for p in stored},
+        **extra,
+    }
+    files.write_json(temporary / "meta.json", meta)
+    shutil.rmtree(final, ignore_errors=True)
+    temporary.rename(final)
+    older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
+    for old in older[keep - 1 :]:
+        shutil.rmtree(old)
+
+
+def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
+    """Copy the weights of a run's newest whole step to `out`, without what only training needs.
+
+    Raises:
+      UserError: as `load_network`.
+    """
+    model = load_network(run, network=network)
+    folder, meta = newest(find(run, network=network))  # type: ignore[misc]
+    known = ("format_version", "network", "network_config", "step", "versions", "sha256")
+    extra = {key: value for key, value in meta.items() if key not in known}
+    config = config_from_json(network, meta["network_config"])
+    save(out, int(folder.name), {"model": nnx.state(model)}, network=network, config=config, extra=extra)
+
+
+def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
+    """The meta data of a step folder, or None if anything in it is missing or changed."""
+    try:
+        meta = json.loads((folder / "meta.json").read_text())
+        good = all(files.file_sha256(folder / name) == digest for name, digest in meta["sha256"].items())
+        good = good and meta["format_version"] == FORMAT_VERSION and meta["network"] in NETWORKS
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return meta if good else None
+
+
+def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
+    """The newest whole step of a run and its meta data; None if there is none."""
+    for folder in _steps(run):
+        meta = _whole(folder)
+        if meta is not None:
+            return folder, meta
+    return None
+
+
+def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
+    """One part of a step, in the structure of `target`, on this process's default device.
+
+    Orbax would put arrays back on the devices that saved them, which another machine does not have; so they are read
+    as NumPy arrays.
+
+    Raises:
+      UserError: the stored arrays have other names or shapes.
+    """
+    stored = _numpy_arrays((folder / name).resolve())
+    wanted = _flat(target)
+    different = sorted(set(stored) ^ set(wanted)) + [
+        key for key in wanted if key in stored and stored[key].shape != _stored_shape(wanted[key])
+    ]
+    if different:
+        raise UserError(
+            f"checkpoint {folder}: made for another architecture ({len(different)} arrays differ, first "
+            f"{different[0]}); train again, or give the run it belongs to"
+        )
+    leaves = [_on_device(stored[key], like=leaf) for key, leaf in wanted.items()]
+    return jax.tree.unflatten(jax.tree.structure(target), leaves)
+
+
+def _is_key(leaf: Any) -> bool:
+    """Whether a leaf is a random key (dropout's), which is stored as its numbers."""
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _stored_shape(leaf: Any) -> tuple[int, ...]:
+    return np.shape(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _on_device(stored: np.ndarray, *, like: Any) -> jax.Array:
+    """A copy of `stored` on the default device (training donates its buffers); a random key where `like` is one."""
+    array = jnp.array(stored)
+    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if _is_key(like) else array
+
+
+def _numpy_arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
+    """The arrays of one Orbax folder by their path in the tree, whatever devices saved them."""
+    checkpointer = ocp.PyTreeCheckpointer()
+    stored = checkpointer.metadata(part).item_metadata.tree
+    as_numpy = {key: ocp.RestoreArgs(restore_type=np.ndarray) for key in stored}
+    restored: dict[str, np.ndarray] = checkpointer.restore(part, restore_args=as_numpy)
+    return restored
+
+
+def digest(model: nnx.Module) -> str:
+    """SHA-256 of a network's parameters."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)):
+        found.update(np.asarray(leaf).tobytes())
+    return found.hexdigest()
+
+
+def config_from_json(name: str, values: dict[str, Any]) -> Any:
+    """A network's config dataclass from `meta.json`."""
+    fields = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return NETWORKS[name][0](**fields)
+
+
+def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
+    """The folder of a run; `builtin` stands for the network that comes with the package, if one does."""
+    if str(run) != "builtin":
+        return run
+    folder = pathlib.Path(__file__).parents[1] / "data" / network
+    if not folder.is_dir():
+        raise UserError(f"builtin: no {network} network comes with this package; give the --out of a dipn-train run")
+    return folder
+
+
+def load_network(run: pathlib.Path, *, network: str) -> nnx.Module:
+    """The network of the newest whole step, in evaluation mode.
+
+    Args:
+      run: a run's folder, or `builtin`.
+      network: a key of NETWORKS, what the caller can use.
+
+    Raises:
+      UserError: no run there, no whole step in it, or it holds another network.
+    """
+    run = find(run, network=network)
+    if not run.is_dir():
+        raise UserError(f"checkpoint {run}: no such folder; give the --out of a dipn-train run")
+    found = newest(run)
+    if found is None:
+        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; train again or give another run")
+    folder, meta = found
+    if meta["network"] != network:
+        raise UserError(f"checkpoint {run}: holds a {meta['network']} network, want {network}; give another run")
+    try:
+        config = config_from_json(network, meta["network_config"])
+    except TypeError as error:
+        raise UserError(f"checkpoint {run}: its config does not fit this version ({error}); train again") from None
+    model = build(network, config)
+    nnx.update(model, restore(folder, "model", nnx.state(model)))
+    model.eval()
+    return model

@@ -1,0 +1,112 @@
+"""Hand-placed scenes from a case file, the format of `hard_cases.json`."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import geometry
+from dipn_jax.errors import UserError
+from dipn_jax.structs import ABSENT, Scene
+from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import scenes, shapes
+
+
+def hard_cases_path() -> pathlib.Path:
+    """The ten hard instances that come with the package."""
+    return pathlib.Path(__file__).parents[1] / "data" / "hard_cases.json"
+
+
+def load_cases(path: pathlib.Path, *, slots: int | None = None) -> tuple[list[str], Scene, np.ndarray]:
+    """Read a case file (the format of `hard_cases.json`).
+
+    Args:
+      path: JSON file with `cases`, each a name and a list of objects.
+      slots: padded number of objects; the largest case's by default.
+
+    Returns:
+      Names, scenes `[C, N, ...]` and poses `[C, N, 7]` as placed: not settled. Density 500 kg/m^3, friction 0.35.
+
+    Raises:
+      UserError: the file is missing, is not JSON, or an object in it has an unknown shape or a wrong size.
+    """
+    try:
+        cases = json.loads(path.read_text())["cases"]
+    except OSError as error:
+        raise UserError(
+            f"case file {path}: {error.strerror}; give a JSON file in the format of {hard_cases_path().name}"
+        ) from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"case file {path}: not a JSON object with a list `cases` ({error!r})") from None
+    if not isinstance(cases, list) or not cases:
+        raise UserError(f"case file {path}: `cases` is not a list of at least one case")
+    for case in cases:
+        objects = case.get("objects") if isinstance(case, dict) else None
+        if not isinstance(objects, list) or not objects or not all(isinstance(entry, dict) for entry in objects):
+            raise UserError(f"case file {path}: a case without a list of `objects`; want at least one object a case")
+    most = max(len(case["objects"]) for case in cases)
+    n = slots or most
+    if most > n:
+        raise UserError(f"case file {path}: a case has {most} objects, but there are {n} slots")
+    names = [str(case.get("name", i)) for i, case in enumerate(cases)]
+    if len(set(names)) < len(names):
+        raise UserError(f"case file {path}: two cases of one name; give each its own")
+    loaded = [_case(case, n, path) for case in cases]
+    scene = jax.tree.map(lambda *leaves: np.stack(leaves), *[scene for scene, _ in loaded])
+    return names, scene, np.stack([p for _, p in loaded])
+
+
+def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, np.ndarray]:
+    objects = case["objects"]
+    where = f"case file {path}, case {case.get('name', '?')}"
+    shape = np.full(n, ABSENT, np.int32)
+    size = np.full((n, 3), 0.05, np.float32)
+    color = np.zeros((n, 3), np.float32)
+    poses = np.array(scenes.parked(n))
+    for i, entry in enumerate(objects):
+        name = entry.get("shape")
+        if name not in shapes.CLASSES:
+            raise UserError(f"{where}, object {i}: unknown shape {name!r}; want one of {', '.join(shapes.CLASSES)}")
+        try:
+            size[i] = _numbers(entry["size_mm"], 3) / 1000
+            position = _numbers(entry["position_m"], 2)
+            quat = _numbers(entry["quaternion_wxyz"], 4)
+            color[i] = _numbers(entry.get("color_rgb", shapes.COLORS_RGB[i % 10]), 3) / 255
+            height = None if entry.get("height_m") is None else float(entry["height_m"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"{where}, object {i}: {error!r}; want size_mm [3], position_m [2], quaternion_wxyz [4]"
+            ) from None
+        if size[i].min() < 0.005 or np.linalg.norm(size[i]) > shapes.MAX_DIAGONAL:
+            raise UserError(
+                f"{where}, object {i}: size_mm {entry['size_mm']}; want 5 mm or more a side and a diagonal of at most "
+                f"{1000 * shapes.MAX_DIAGONAL:.0f} mm"
+            )
+        if not (height is None or 0 < height < 1) or color[i].min() < 0 or color[i].max() > 1:
+            raise UserError(f"{where}, object {i}: height_m or color_rgb is out of range; want 0 to 1 m, 0 to 255")
+        if np.abs(position).max() > WORKSPACE.half or np.linalg.norm(quat) < 1e-6:
+            raise UserError(
+                f"{where}, object {i}: position_m {entry['position_m']} or quaternion_wxyz is out of range; want "
+                f"|x|, |y| <= {WORKSPACE.half} and a non-zero quaternion"
+            )
+        shape[i] = shapes.CLASSES.index(name)
+        quat = quat / np.linalg.norm(quat)
+        rotation = np.asarray(geometry.quat_to_matrix(jnp.asarray(quat)))
+        corners = shapes.UNIT_VERTICES[shape[i]][shapes.CORNERS_USED[shape[i]] > 0].reshape(-1, 3) * size[i]
+        center = rotation @ (shapes.UNIT_CENTER_OF_MASS[shape[i]] * size[i])  # from the middle of the box
+        resting = 0.0005 - float((corners @ rotation[2]).min())
+        z = resting if height is None else height + center[2]
+        poses[i] = np.concatenate([position + center[:2], [z], quat])
+    return scenes.nominal(Scene(shape, size, color, np.zeros(n), np.zeros(n))), poses
+
+
+def _numbers(values: Any, length: int) -> np.ndarray:
+    array = np.asarray(values, np.float32)
+    if array.shape != (length,) or not np.isfinite(array).all():
+        raise ValueError(f"{values} is not {length} finite numbers")
+    return array

@@ -1,0 +1,87 @@
+"""key -> scenes at rest, and what the camera sees of many scenes. Data generation and evaluation both begin here."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import numpy as np
+
+from dipn_jax import batching, structs
+from dipn_jax.engine import Engine
+from dipn_jax.errors import UserError
+from dipn_jax.structs import Array, Fault, Grasp, Scene, SettledScene
+from dipn_jax.world import primitives, scenes
+
+MAX_DROPS = 128
+"""Drops in a row without a usable scene before giving up."""
+
+
+def settled(
+    key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int
+) -> tuple[SettledScene, dict[str, int]]:
+    """Drop `count` random scenes and keep those that came to rest inside the workspace without a fault.
+
+    Args:
+      key: random key.
+      engine: physics.
+      config: distributions.
+      count: scenes dropped.
+
+    Returns:
+      The scenes kept `[K]`, and how many were dropped and why others were not kept.
+    """
+    draw = functools.partial(_random_scenes, config=config)
+    scene, poses = jax.tree.map(np.asarray, batching.in_chunks(draw, jax.random.split(key, count)))
+    rollout = primitives.settle(engine, scene, poses, fence=primitives.FENCE_TIME)
+    fault = np.asarray(rollout.fault)
+    everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)
+    counts = {f"settle_{name}": n for name, n in Fault.count(fault).items()}
+    return structs.take(everything, fault == 0), {"dropped_scenes": count, **counts}
+
+
+def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
+    """`count` scenes at rest, however many drops it takes.
+
+    Raises:
+      UserError: `MAX_DROPS` drops in a row gave none.
+    """
+    kept: list[SettledScene] = []
+    in_vain = 0
+    while (missing := count - sum(len(batch.fault) for batch in kept)) > 0:
+        key, drop = jax.random.split(key)
+        tries = min(engine.batch, int(1.2 * missing) + 2)
+        batch, counts = settled(drop, engine, config, tries)
+        in_vain = 0 if len(batch.fault) else in_vain + tries
+        if in_vain >= MAX_DROPS:
+            raise UserError(
+                f"scenes: {in_vain} drops, none at rest inside the workspace ({counts}); ask for fewer objects"
+            )
+        kept.append(structs.take(batch, slice(0, missing)))
+    return structs.concatenate(kept)
+
+
+def grasp_away(
+    engine: Engine, scene: Scene, poses: Array, grasps: Grasp
+) -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
+    """Execute one grasp a scene, take away what is held, let the rest come to rest.
+
+    Args:
+      engine: physics.
+      scene: `[B, N]`.
+      poses: `[B, N, 7]`.
+      grasps: `[B]`.
+
+    Returns:
+      Scenes and poses `[B, N, 7]` afterwards, objects held `[B, N]` bool, and faults `[B]` of both simulations.
+    """
+    rollout, outcome = primitives.grasp(engine, scene, poses, grasps)
+    held = np.asarray(outcome.held)
+    scene, after = jax.device_get(scenes.remove(scene, np.asarray(rollout.poses)[:, -1], held))
+    rest = primitives.settle(engine, scene, after, duration=primitives.RESETTLE_TIME)
+    return scene, np.asarray(rest.poses)[:, -1], held, np.asarray(rollout.fault) | np.asarray(rest.fault)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _random_scenes(keys: jax.Array, config: scenes.SceneConfig) -> tuple[Scene, jax.Array]:
+    return jax.vmap(lambda k: scenes.random_scene(k, config=config))(keys)

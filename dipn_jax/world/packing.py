@@ -1,0 +1,77 @@
+"""Objects that were not let fall but put side by side: rows that no gripper fits into, as in the hard instances."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import geometry
+from dipn_jax.world import shapes
+
+ROWS = 3
+"""Most rows of a scene."""
+MOST = 4 * ROWS
+"""Objects that there is room for: four in a row."""
+GAPS = (0.0005, 0.004)
+"""Metres between neighbours, least and most; a finger is thicker."""
+REACH = 0.13
+"""Metres from the workspace's centre along x or y within which the rows' middle lies, less their own size."""
+DROPPED = 0.3
+"""Share of scenes whose last object falls onto or beside the others."""
+
+
+def _quarter_turns() -> np.ndarray:
+    """Quaternions `[24, 4]` (wxyz) of the rotations that map a cube onto itself."""
+    whole = [np.array(v, float) for v in itertools.product((0, 1, -1), repeat=4) if np.abs(v).sum() in (1, 2, 4)]
+    first = [v / np.linalg.norm(v) for v in whole if v[np.flatnonzero(v)[0]] > 0]  # q and -q are one rotation
+    return np.unique(np.round(first, 12), axis=0).astype(np.float32)
+
+
+QUARTER_TURNS = _quarter_turns()
+
+
+def pack(key: jax.Array, shape: jax.Array, size: jax.Array, present: jax.Array) -> jax.Array:
+    """Objects side by side in up to ROWS rows, each on one of its faces, all turned by the same angle.
+
+    Args:
+      key: random key.
+      shape: `[N]` int32, index into `shapes.CLASSES`; ABSENT where there is none.
+      size: `[N, 3]` metres.
+      present: `[N]` bool.
+
+    Returns:
+      Poses `[N, 7]`, a millimetre above the table; in a share of scenes the last object is 0.2 m up, anyhow turned.
+    """
+    n = shape.shape[0]
+    keys = jax.random.split(key, 8)
+    turn = jnp.asarray(QUARTER_TURNS)[jax.random.randint(keys[0], (n,), 0, len(QUARTER_TURNS))]
+    extent = jnp.einsum("nij,nj->ni", jnp.abs(geometry.quat_to_matrix(turn)), size)
+    rows = jax.random.randint(keys[1], (), 1, ROWS + 1)
+    rows = jnp.maximum(rows, (present.sum() + 3) // 4)  # four in a row at most, while ROWS allow it
+    row = jnp.arange(n) % rows
+    gap = jax.random.uniform(keys[2], (n,), minval=GAPS[0], maxval=GAPS[1])
+    same = (row[:, None] == row) & present
+    before = same & (jnp.arange(n) < jnp.arange(n)[:, None])
+    length = jnp.where(same, extent[:, 0] + gap, 0.0).sum(1)
+    x = jnp.where(before, extent[:, 0] + gap, 0.0).sum(1) + extent[:, 0] / 2 - length / 2
+    depth = jnp.stack([jnp.where((row == r) & present, extent[:, 1], 0.0).max() for r in range(ROWS)])
+    lines = jnp.concatenate([jnp.zeros(1), jnp.cumsum(depth + gap[0])])
+    y = lines[row] + depth[row] / 2 - lines[-1] / 2
+    jitter = jnp.deg2rad(jax.random.uniform(keys[3], (n,), minval=-2.0, maxval=2.0))
+    yaw = jax.random.uniform(keys[4], (), maxval=2 * jnp.pi)
+    room = jnp.maximum(REACH - jnp.hypot(length.max(), lines[-1]) / 2, 0.0)
+    shift = jax.random.uniform(keys[5], (2,), minval=-1.0, maxval=1.0) * room
+    middle = geometry.rotate2d(jnp.stack([x, y], -1), yaw) + shift
+    quat = geometry.quat_multiply(geometry.quat_about_z(yaw + jitter), turn)
+    center = jnp.column_stack([middle, extent[:, 2] / 2 + 0.001])
+    falls = jax.random.bernoulli(keys[6], DROPPED) & (jnp.arange(n) == present.sum() - 1)
+    spot = jax.random.uniform(keys[7], (2,), minval=-0.1, maxval=0.1)
+    center = jnp.where(falls[:, None], jnp.append(spot, 0.2), center)
+    tumbled: jax.Array = geometry.random_quat(keys[6], shape=(n,))
+    quat = jnp.where(falls[:, None], tumbled, quat)
+    offset = jnp.asarray(shapes.UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(shape, 0)] * size
+    mass_center = center + jnp.einsum("nij,nj->ni", geometry.quat_to_matrix(quat), offset)
+    return jnp.concatenate([mass_center, quat], -1)

@@ -1,0 +1,204 @@
+"""Random clutter from a key, in mid-air or packed."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import geometry
+from dipn_jax.errors import UserError
+from dipn_jax.structs import ABSENT, Array, Scene
+from dipn_jax.world import packing, shapes
+
+PAPER_COUNTS = (0.02, 0.05, 0.2, 0.35, 0.3, 0.05, 0.03)
+"""P(1..7 objects) of the push data. Source: DIPN's released code."""
+
+
+MIN_SIDE = 0.025
+"""Metres: no side is thinner. The fingertips stop 20 mm above the table, and 2.5 mm of pad cannot hold a box."""
+
+NOMINAL_DENSITY, NOMINAL_FRICTION = 500.0, 0.35
+"""kg/m^3, and between object and table: of what is not known."""
+
+Range: TypeAlias = tuple[float, float]
+BOUNDS = {"scale": (0.5, 1.2), "density": (10.0, 25_000.0), "friction": (0.01, 5.0)}
+"""Least and most of each range: cork to platinum; what the renderer's window and the fingers' height allow."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranges:
+    """What random objects are drawn from, all uniformly."""
+
+    items: tuple[str, ...] = ()
+    """Names from the catalogue (`shapes.CATALOGUE`); none given: all of them."""
+    scale: Range = (0.9, 1.03)
+    """Of each nominal dimension; no side is thinner than 25 mm, no diagonal longer than 126 mm."""
+    density: Range = (250.0, 750.0)
+    """kg/m^3."""
+    friction: Range = (0.28, 0.42)
+    """Sliding coefficient between object and table; between objects it is 0.5 / 0.35 of the larger of two."""
+    color_noise: float = 0.0
+    """Most by which each channel, in [0, 1], differs from a colour of the palette."""
+    packed: float = 0.0
+    """Share of scenes whose objects are not let fall but stand side by side in rows."""
+
+    def __post_init__(self) -> None:
+        for name, (least, most) in BOUNDS.items():
+            low, high = getattr(self, name)
+            if not least <= low <= high <= most:
+                raise UserError(f"--{name} {low:g} {high:g}: want two numbers from {least:g} to {most:g}, in order")
+        for name in ("color_noise", "packed"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UserError(f"--{name.replace('_', '-')} {getattr(self, name):g}: want 0 to 1")
+        names = [item.name for item in shapes.CATALOGUE]
+        unknown = [name for name in self.items if name not in names]
+        if unknown:
+            raise UserError(f"--items {' '.join(unknown)}: not in the catalogue; choose from {' '.join(sorted(names))}")
+
+
+DEFAULT_RANGES = Ranges()
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneConfig:
+    """What random scenes are made of."""
+
+    slots: int = 7  # padded number of objects
+    counts: tuple[float, ...] = PAPER_COUNTS  # probability of 1, 2, ... objects
+    ranges: Ranges = DEFAULT_RANGES
+    spread: float = 0.24  # metres: side of the square the objects' centres are dropped in
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.counts) <= self.slots:
+            raise UserError(
+                f"scene config: {len(self.counts)} object counts for {self.slots} slots; want 1 to {self.slots}"
+            )
+        if min(self.counts) < 0 or sum(self.counts) <= 0:
+            raise UserError(f"scene config: counts {self.counts} are not probabilities; want non-negative, sum > 0")
+        if self.ranges.packed and len(self.counts) > packing.MOST:
+            raise UserError(
+                f"--packed with up to {len(self.counts)} objects: no more than {packing.MOST} stand in rows; "
+                "give fewer objects, or --packed 0"
+            )
+
+
+PAPER = SceneConfig()
+"""Of the push data, as published."""
+
+
+def fixed_count(count: int, **changes: Any) -> SceneConfig:
+    """A config with exactly `count` objects."""
+    return SceneConfig(slots=count, counts=(0.0,) * (count - 1) + (1.0,), **changes)
+
+
+def parse_objects(text: str, *, ranges: Ranges = DEFAULT_RANGES) -> SceneConfig:
+    """A config from a user's word: `10`, `1:7` (uniform) or `paper` (PAPER_COUNTS).
+
+    More than ten objects are dropped over a wider square, so that their tower is not too high to fall from.
+
+    Raises:
+      UserError: the text is none of these.
+    """
+    if text == "paper":
+        return dataclasses.replace(PAPER, ranges=ranges)
+    low, _, high = text.partition(":")
+    try:
+        first, last = int(low), int(high or low)
+    except ValueError:
+        raise UserError(f"--objects {text}: want a number, a range like 1:7, or paper") from None
+    if not 1 <= first <= last <= 30:
+        raise UserError(f"--objects {text}: want 1 to 30, smaller number first")
+    counts = (0.0,) * (first - 1) + (1.0 / (last - first + 1),) * (last - first + 1)
+    return SceneConfig(slots=last, counts=counts, ranges=ranges, spread=0.24 if last <= 10 else 0.30)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Array]:
+    """Random objects in mid-air, none touching another; or packed (`Ranges.packed`).
+
+    Args:
+      key: random key.
+      config: distributions.
+
+    Returns:
+      The scene, and poses `[N, 7]`: random positions and orientations, each object just above the
+      bounding spheres of those before it, or rows of `packing`. Empty slots are parked outside the workspace.
+    """
+    n, ranges = config.slots, config.ranges
+    keys = jax.random.split(key, 9)
+    items = [i for i in shapes.CATALOGUE if not ranges.items or i.name in ranges.items]
+    classes = jnp.array([shapes.CLASSES.index(i.shape) for i in items])
+    nominal = jnp.array([i.size_mm for i in items], jnp.float32) / 1000
+    count = 1 + jax.random.categorical(keys[0], jnp.log(jnp.array(config.counts)))
+    present = jnp.arange(n) < count
+    item = jax.random.randint(keys[1], (n,), 0, len(items))
+    shape = jnp.where(present, classes[item], ABSENT)
+    size = nominal[item] * jax.random.uniform(keys[2], (n, 3), minval=ranges.scale[0], maxval=ranges.scale[1])
+    size = _allowed(size)
+    colors = jnp.array(shapes.COLORS_RGB, jnp.float32) / 255
+    palette = jax.random.permutation(keys[3], len(colors))
+    noise = ranges.color_noise * jax.random.uniform(keys[8], (n, 3), minval=-1.0)
+    color = jnp.clip(colors[palette[jnp.arange(n) % len(colors)]] + noise, 0.0, 1.0)
+    density = jax.random.uniform(keys[4], (n,), minval=ranges.density[0], maxval=ranges.density[1])
+    mass = density * jnp.asarray(shapes.UNIT_VOLUME, jnp.float32)[classes[item]] * size.prod(-1)
+    friction = jax.random.uniform(keys[5], (n,), minval=ranges.friction[0], maxval=ranges.friction[1])
+    xy = jax.random.uniform(keys[6], (n, 2), minval=-0.5, maxval=0.5) * config.spread
+    quat = geometry.random_quat(keys[7], shape=(n,))
+    radius = shapes.radius(shape, size)
+    z = _stack_heights(xy, radius, present)
+    poses = jnp.concatenate([xy, z[:, None], quat], -1)
+    if ranges.packed:
+        pack_key, which_key = jax.random.split(jax.random.fold_in(key, 1))
+        rows = packing.pack(pack_key, shape, size, present)
+        poses = jnp.where(jax.random.bernoulli(which_key, ranges.packed), rows, poses)
+    poses = jnp.where(present[:, None], poses, parked(n))
+    return Scene(shape.astype(jnp.int32), size, color, mass, friction), poses
+
+
+def _allowed(size: jax.Array) -> jax.Array:
+    """Sizes `[N, 3]` with no side under MIN_SIDE and the longest cut where the diagonal is over MAX_DIAGONAL."""
+    size = jnp.maximum(size, MIN_SIDE)
+    longest = jnp.arange(3) == size.argmax(-1, keepdims=True)
+    others = jnp.where(longest, 0.0, size**2).sum(-1, keepdims=True)
+    limit = jnp.sqrt(jnp.maximum(shapes.MAX_DIAGONAL**2 - others, MIN_SIDE**2))
+    return jnp.where(longest, jnp.minimum(size, limit), size)
+
+
+def _stack_heights(xy: jax.Array, radius: jax.Array, present: jax.Array) -> jax.Array:
+    """Lowest heights `[N]` at which spheres of `radius [N]` over `xy [N, 2]` do not overlap, placed in order."""
+
+    def place(heights: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
+        gap = (xy - xy[i]) ** 2
+        reach = (radius + radius[i] + 0.002) ** 2 - gap.sum(-1)
+        before = (jnp.arange(len(radius)) < i) & present & (reach > 0)
+        above = jnp.where(before, heights + jnp.sqrt(jnp.maximum(reach, 0.0)), 0.0)
+        return heights.at[i].set(jnp.maximum(radius[i] + 0.005, above.max())), None
+
+    heights, _ = jax.lax.scan(place, jnp.zeros_like(radius), jnp.arange(len(radius)))
+    return heights
+
+
+def parked(n: int) -> jax.Array:
+    """Poses `[N, 7]` of empty slots: far outside the workspace, apart from one another."""
+    x = 5.0 + 0.5 * jnp.arange(n, dtype=jnp.float32)
+    zero, one = jnp.zeros(n), jnp.ones(n)
+    return jnp.stack([x, zero + 5.0, zero + 1.0, one, zero, zero, zero], -1)
+
+
+def remove(scene: Scene, poses: Array, gone: Array) -> tuple[Scene, jax.Array]:
+    """Scenes `[..., N]` and poses `[..., N, 7]` without the objects `gone [..., N]`, which are parked."""
+    shape = jnp.where(gone, ABSENT, scene.shape)
+    return scene.replace(shape=shape), jnp.where(gone[..., None], parked(gone.shape[-1]), poses)
+
+
+def nominal(scene: Scene) -> Scene:
+    """Scenes `[..., N]` as one who sees only shapes would guess them: density 500 kg/m^3, friction 0.35."""
+    shape = np.asarray(scene.shape)
+    mass = np.where(shape >= 0, NOMINAL_DENSITY * shapes.volume(shape, np.asarray(scene.size)), 0.1)
+    friction = np.full(shape.shape, NOMINAL_FRICTION, np.float32)
+    return scene.replace(mass=mass.astype(np.float32), friction=friction)

@@ -1,0 +1,191 @@
+"""`dipn-eval clear` and `sweep`."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import Annotated, Any
+
+import tyro
+
+from dipn_jax import console
+from dipn_jax.engine import Engine, EngineName
+from dipn_jax.errors import UserError
+from dipn_jax.physics import make_engine
+from dipn_jax.planning import policy
+from dipn_jax.storage import checkpoint, resume
+from dipn_jax.world import scenes
+
+from .. import metrics, options
+from . import lockstep, methods, sweeping
+from .instances import Tables
+
+MAX_CANDIDATES = 4096
+LONG = 0.10
+"""Metres of a push that are simulated at least: a shorter one is looked at when a long one has ended."""
+
+
+DEFAULT_TABLES = Tables()
+
+
+def clear(
+    out: pathlib.Path,
+    method: methods.MethodName = "dipn+gn",
+    push_net: pathlib.Path | None = None,
+    grasp_net: pathlib.Path | None = None,
+    value_net: pathlib.Path | None = None,
+    tables: Annotated[Tables, tyro.conf.arg(name="")] = DEFAULT_TABLES,
+    candidates: int = 32,
+    distance: float = 0.10,
+    gamma: float = 0.9,
+    threshold: float = 0.7,
+    released: bool = False,
+    cautious: bool = True,
+    remember: bool = True,
+    label: str = "",
+    seed: int = 1_000_000,
+    engine: EngineName = "auto",
+) -> None:
+    """Clear tables: push or grasp, until nothing is left.
+
+      dipn-eval clear --push-net builtin --grasp-net builtin --cases hard --instances 30 --out results/hard
+      dipn-eval clear --push-net builtin --grasp-net builtin --cases random --objects 30 --instances 30 --out results/30
+
+    The compared methods: gn (grasps only), physics+gn (the engine itself as predictor), and with networks of dipn-train
+    baseline rea+dipn, dqn+gn and vpg:
+      dipn-eval clear --method dqn+gn --value-net runs/dqn --grasp-net builtin --out results/dqn
+
+    Args:
+      out: folder for metrics.json and every step of every table.
+      method: who decides.
+      push_net: run of dipn-train push, or builtin.
+      grasp_net: run of dipn-train grasp, or builtin.
+      value_net: run of dipn-train baseline.
+      tables: which.
+      candidates: pushes considered at a time.
+      distance: metres of a push.
+      gamma: discount of a push's value.
+      threshold: grasp at once above this score.
+      released: decide by the clauses of DIPN's released code, too: a lone object is grasped, a push must raise the best
+        score, gamma discounts only pushes after which that is over 0.5, and no object may come near the edge.
+      cautious: GN's score of a grasp is the least of what it says of the grasp and its mirror images, and is halved
+        where the height map speaks against it; no: as published. Means of imagined images are as published anyway.
+      remember: halve the scores of grasps like one that missed until something near them moves; no: as published.
+      label: what sets this apart from others of the same method, for the report: the data learnt from, say.
+      seed: of scenes, perturbations and candidates.
+      engine: physics.
+    """
+    settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+    del settings["tables"]
+    plan = _plan(out, seed, method, candidates, (distance,), gamma, threshold, released)
+    plan = dataclasses.replace(plan, cautious=cautious, remember=remember)
+    nets, physics = methods.Nets(push_net, grasp_net, value_net), make_engine(engine)
+    decide = methods.load(plan, nets, physics, slots=tables.slots())
+    _cleared(out, decide, physics, tables, settings, nets.require(method), longest=max(distance, LONG))
+
+
+def _plan(
+    out: pathlib.Path,
+    seed: int,
+    method: methods.MethodName,
+    candidates: int,
+    distances: tuple[float, ...],
+    gamma: float,
+    threshold: float,
+    released: bool,
+) -> methods.Plan:
+    """The plan of options that make sense."""
+    options.check(out, seed, candidates=candidates)
+    console.require_between(1, MAX_CANDIDATES, candidates=candidates)
+    for distance in distances:
+        console.require_between(0.01, methods.LONGEST, distance=distance)
+    console.require_between(0.0, 10.0, gamma=gamma, threshold=threshold)
+    return methods.Plan(method, candidates, distances, gamma, threshold, released)
+
+
+def sweep(
+    out: pathlib.Path,
+    push_net: pathlib.Path,
+    grasp_net: pathlib.Path,
+    distances: str = "0.03:0.12:0.01",
+    tables: Annotated[Tables, tyro.conf.arg(name="")] = DEFAULT_TABLES,
+    candidates: int = 32,
+    pushes: int = 200,
+    gamma: float = 0.9,
+    threshold: float = 0.7,
+    seed: int = 1_000_000,
+    engine: EngineName = "auto",
+) -> None:
+    """Clear the same tables at one push distance after another, and with the policy that chooses the distance itself.
+
+    Prediction error, completion and efficiency against distance:
+      dipn-eval sweep --push-net builtin --grasp-net builtin --instances 10 --out results/sweep
+
+    Args:
+      out: folder for metrics.json and sweep.png, and in a folder for each distance what dipn-eval clear writes.
+      push_net: run of dipn-train push, or builtin; beyond 10 cm objects go on as in the last centimetre.
+      grasp_net: run of dipn-train grasp, or builtin.
+      distances: first:last:step, metres, to 0.12.
+      tables: which.
+      candidates: pushes considered at a time; the choosing policy gives each of them one of the distances.
+      pushes: scenes of 1 to 7 objects, a push in each, for the prediction error; 0: do not measure it.
+      gamma: discount of a push's value.
+      threshold: grasp at once above this score.
+      seed: of scenes, perturbations and candidates.
+      engine: physics.
+    """
+    settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+    settings |= {"method": "dipn+gn", "label": ""}
+    del settings["tables"]
+    every = sweeping.parse(distances)
+    console.require_between(0, 100_000, pushes=pushes)
+    if candidates < len(every):
+        raise UserError(f"--candidates {candidates}: want at least one for each of the {len(every)} distances")
+    each = {sweeping.name(distance): (distance,) for distance in every} | {sweeping.CHOSEN: every}
+    plans = [_plan(out, seed, "dipn+gn", candidates, spread, gamma, threshold, False) for spread in each.values()]
+    nets = methods.Nets(push_net, grasp_net)
+    physics = make_engine(engine)
+    runs = nets.require("dipn+gn")
+    kept = resume.Partial(out, settings, inputs=_inputs(runs, tables))
+    ended: dict[str, dict[str, Any]] = kept.load({})
+    deciders = methods.load_each(plans, nets, physics, slots=tables.slots())
+    for name, decide in zip(each, deciders, strict=True):
+        if name not in ended:
+            mine = settings | {"label": name}
+            ended[name] = _cleared(out / name, decide, physics, tables, mine, runs, longest=max(every))
+            kept.save(ended)
+    values = {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
+    if pushes:
+        predictor = policy.load_predictor(checkpoint.find(push_net, network="dipn"), scenes.PAPER.slots)
+        measure: dict[str, Any] = {"scenes": pushes, "seed": seed, "longest": max(every)}
+        values |= sweeping.prediction_errors(predictor, physics, scenes.PAPER, every, **measure)
+    sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
+    metrics.write(out, values, settings={key: options.plain(value) for key, value in settings.items()})
+    kept.finish()
+    console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
+
+
+def _inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]:
+    """What the course of things depends on, besides the options."""
+    path = tables.path()
+    return [*runs.values(), *([path] if path else [])]
+
+
+def _cleared(
+    out: pathlib.Path,
+    decide: methods.Decider,
+    physics: Engine,
+    tables: Tables,
+    settings: dict[str, Any],
+    runs: dict[str, pathlib.Path],
+    *,
+    longest: float,
+) -> dict[str, Any]:
+    """Clear tables and write what came of it; goes on where it was interrupted."""
+    seed = settings["seed"]
+    partial = resume.Partial(out, settings, inputs=_inputs(runs, tables))
+    ended = lockstep.clear(tables.make(physics, seed=seed), physics, decide, partial, seed=seed, longest=longest)
+    lockstep.save(ended, out)
+    values = lockstep.summary(ended)
+    options.finish(out, values, settings, partial)
+    return values

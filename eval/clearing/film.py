@@ -1,0 +1,79 @@
+"""Episodes of clearing a table, kept as states: pictures of any step are drawn when they are wanted."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import pathlib
+import zipfile
+import zlib
+from typing import Any
+
+import numpy as np
+
+from dipn_jax import files
+from dipn_jax.errors import UserError
+from dipn_jax.sight import imagine, masks, render
+from dipn_jax.structs import Scene
+
+from .instances import Instance
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """T actions on one table of N objects."""
+
+    what: np.ndarray  # [T] str: push, grasp held, grasp missed
+    shape: np.ndarray  # [T + 1, N] int32: which objects there are, before each action and at the end
+    poses: np.ndarray  # [T + 1, N, 7] metres, wxyz
+    push: np.ndarray  # [T, 4] x, y (metres), angle (radians), distance (metres) of the best push
+    grasp: np.ndarray  # [T, 3] rotation, row, column of the best grasp
+    values: np.ndarray  # [T, 3] its score; mean score now; gamma times the mean after the push, -inf if none
+    motion: np.ndarray  # [T, N, 3] dx, dy (metres), dtheta (radians) predicted for the push
+    size: np.ndarray  # [N, 3] metres
+    color: np.ndarray  # [N, 3]
+    mass: np.ndarray  # [N] kg
+    friction: np.ndarray  # [N]
+
+    def before(self, step: int) -> np.ndarray:
+        """Colours `[224, 224, 3]` before an action."""
+        scene = Scene(self.shape[step], self.size, self.color, self.mass, self.friction)
+        return np.asarray(render.render(scene, self.poses[step]).color)
+
+    def pictures(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Colours `[224, 224, 3]` before an action, as predicted for the best push, and after the action."""
+
+        def scene(at: int) -> Scene:
+            return Scene(self.shape[at], self.size, self.color, self.mass, self.friction)
+
+        seen = render.render(scene(step), self.poses[step])
+        centers, _ = masks.mask_centers(seen.label, self.shape.shape[1])
+        predicted = imagine.imagine(seen, centers, self.motion[step])
+        after = render.render(scene(step + 1), self.poses[step + 1])
+        return np.asarray(seen.color), np.asarray(predicted.color), np.asarray(after.color)
+
+
+def save(path: pathlib.Path, instance: Instance) -> None:
+    """Write the film of a table that has ended."""
+    steps: dict[str, Any] = {key: np.stack([step[key] for step in instance.film]) for key in instance.film[0]}
+    steps["shape"] = np.concatenate([steps["shape"], instance.scene.shape[None]])
+    steps["poses"] = np.concatenate([steps["poses"], instance.poses[None]])
+    scene = {key: getattr(instance.scene, key) for key in ("size", "color", "mass", "friction")}
+    stream = io.BytesIO()
+    np.savez_compressed(stream, what=np.array(instance.did), **steps, **scene)
+    files.write_atomically(path, stream.getvalue())
+
+
+def load(path: pathlib.Path) -> Film:
+    """Read a film.
+
+    Raises:
+      UserError: it is missing, damaged or not a film.
+    """
+    try:
+        with np.load(path) as arrays:
+            return Film(**{field.name: arrays[field.name] for field in dataclasses.fields(Film)})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        raise UserError(
+            f"{path}: missing, damaged or no film; run the dipn-eval command that writes it again"
+        ) from None

@@ -1,0 +1,136 @@
+"""The tables to clear: hand-placed cases with perturbed physics, and random clutter."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+
+from dipn_jax import console, structs
+from dipn_jax.engine import Engine
+from dipn_jax.errors import UserError
+from dipn_jax.structs import Fault, Scene
+from dipn_jax.world import cases as case_files
+from dipn_jax.world import clutter, primitives, scenes
+
+JITTER = 0.002
+"""Metres by which an object of a repeated case is moved at most."""
+MASS_FACTOR, FRICTION_FACTOR = (0.8, 1.2), (0.85, 1.15)
+"""By which those of its objects are multiplied."""
+
+
+@dataclasses.dataclass
+class Instance:
+    """One table being cleared."""
+
+    name: str
+    scene: Scene  # numpy, [N]
+    poses: np.ndarray  # [N, 7]
+    objects: int
+    grasps: int = 0
+    pushes: int = 0
+    removed: int = 0
+    held: int = 0  # grasps that held something
+    ended: str = ""  # cleared, pushed out, out of actions, fault
+    did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action
+    missed: tuple[np.ndarray, ...] = ()  # grasps [3] that missed and around which nothing has moved since
+    film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # what preceded each action
+
+    @property
+    def actions(self) -> int:
+        return self.grasps + self.pushes
+
+
+def hard_instances(
+    engine: Engine, path: pathlib.Path, names: list[str] | None, *, slots: int, repeats: int, seed: int
+) -> list[Instance]:
+    """The cases of a file, settled; `repeats` of each, all but the first moved by up to JITTER and reweighed.
+
+    A repeat of a case is the same however many others there are.
+
+    Raises:
+      UserError: a name is not in the file.
+    """
+    found, scene, poses = case_files.load_cases(path, slots=slots)
+    wanted = names or found
+    missing = [name for name in wanted if name not in found]
+    if missing:
+        raise UserError(f"cases {missing}: not in {path}; it has {found}")
+    index = np.array([found.index(name) for name in wanted for _ in range(repeats)])
+    scene, poses = structs.take(scene, index), poses[index].copy()
+    mass, friction = np.array(scene.mass), np.array(scene.friction)
+    for row, case in enumerate(index):
+        if repeat := row % repeats:
+            rng = np.random.default_rng([seed, case, repeat])
+            reach, angle = JITTER * np.sqrt(rng.uniform(size=slots)), rng.uniform(0, 2 * np.pi, slots)
+            poses[row, :, :2] += reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+            mass[row] *= rng.uniform(*MASS_FACTOR, slots)
+            friction[row] *= rng.uniform(*FRICTION_FACTOR, slots)
+    scene = scene.replace(mass=mass, friction=friction)
+    rollout = primitives.settle(engine, scene, poses)
+    wrong = np.flatnonzero(np.asarray(rollout.fault) & (Fault.UNUSABLE | Fault.OUTSIDE))
+    if len(wrong):
+        first = wrong[0]
+        what = [name for name, hit in Fault.count(rollout.fault[first : first + 1]).items() if hit]
+        raise UserError(
+            f"case {found[index[first]]} of {path}: does not come to rest in the workspace ({', '.join(what)}); "
+            "objects that overlap or stand at its edge must be moved"
+        )
+    return _instances([found[i] for i in index], scene, np.asarray(rollout.poses)[:, -1])
+
+
+def random_instances(engine: Engine, config: scenes.SceneConfig, *, count: int, seed: int) -> list[Instance]:
+    """`count` random settled scenes."""
+    items = clutter.settled_exactly(jax.random.key(seed), engine, config, count)
+    return _instances([f"random-{i}" for i in range(count)], items.scene, items.poses)
+
+
+def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instance]:
+    return [
+        Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
+        for i, name in enumerate(names)
+    ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tables:
+    """Which tables are cleared."""
+
+    cases: str = "hard"
+    """hard (the ten hand-placed instances), random, or a case file of your own."""
+    names: tuple[str, ...] = ()
+    """Only these cases of the file."""
+    objects: str = "10"
+    """Number of objects (random): 10, 1:7 (uniform), or `paper`."""
+    instances: int = 1
+    """Tables (random), or repeats of each case with perturbed physics."""
+
+    def __post_init__(self) -> None:
+        console.require_positive(instances=self.instances)
+        if self.names and self.cases == "random":
+            raise UserError("--names: random tables have none; give --cases hard or a case file")
+
+    def path(self) -> pathlib.Path | None:
+        """The case file, if there is one."""
+        if self.cases == "random":
+            return None
+        return case_files.hard_cases_path() if self.cases == "hard" else pathlib.Path(self.cases)
+
+    def slots(self) -> int:
+        """Most objects on one of them."""
+        path = self.path()
+        if path is None:
+            return scenes.parse_objects(self.objects).slots
+        return int(case_files.load_cases(path)[1].shape.shape[1])
+
+    def make(self, engine: Engine, *, seed: int) -> list[Instance]:
+        """All of them, at rest."""
+        path = self.path()
+        if path is None:
+            config = scenes.parse_objects(self.objects)
+            return random_instances(engine, config, count=self.instances, seed=seed)
+        options: dict[str, Any] = {"slots": self.slots(), "repeats": self.instances, "seed": seed}
+        return hard_instances(engine, path, list(self.names) or None, **options)

@@ -1,0 +1,194 @@
+"""Clear tables, many instances in lockstep, to the end rules of the paper."""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax import console, files, geometry, structs
+from dipn_jax.engine import Engine
+from dipn_jax.planning import planner
+from dipn_jax.storage import resume
+from dipn_jax.structs import Fault
+from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
+from dipn_jax.world import clutter, primitives
+
+from .. import metrics
+from . import film
+from .choices import Choice
+from .instances import Instance
+from .methods import Decider
+
+ACTIONS_PER_OBJECT = 3
+"""Source: the paper; more actions than that is a failure."""
+MISSES = 8
+"""Grasps that missed which are kept in mind, the latest."""
+STAYED, AROUND = 0.005, 0.06
+"""Metres: what has moved by more, so near the centre of a grasp that missed, makes it worth trying again."""
+
+
+def clear(
+    instances: list[Instance],
+    engine: Engine,
+    decide: Decider,
+    partial: resume.Partial,
+    *,
+    seed: int,
+    longest: float = PUSH_STEPS * 0.01,
+) -> list[Instance]:
+    """Act on every instance until all have ended; those that have not are decided on, and simulated, together.
+
+    What happens on one table does not depend on the others.
+
+    Args:
+      instances: settled tables; changed in place, or replaced by those of an interrupted evaluation.
+      engine: physics.
+      decide: what to do next.
+      partial: where an interrupted evaluation is kept.
+      seed: of the push candidates.
+      longest: metres of the longest push that `decide` asks for.
+
+    Returns:
+      The instances, ended.
+    """
+    total = sum(instance.objects for instance in instances)
+    instances = partial.load(instances)
+    keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(instances))]
+    with console.Progress("clear", total, unit="objects", done=sum(i.removed for i in instances)) as progress:
+        while active := [number for number, instance in enumerate(instances) if not instance.ended]:
+            rows = [instances[number] for number in active]
+            before = sum(instance.removed for instance in instances)
+            scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
+            now = jnp.stack([jax.random.fold_in(keys[number], instances[number].actions) for number in active])
+            choice = decide(now, scene, poses, np.stack([_missed(row) for row in rows]))
+            for is_push, act in ((True, functools.partial(_push, longest=longest)), (False, _grasp)):
+                which = np.flatnonzero(choice.is_push == is_push)
+                if len(which):
+                    act([rows[i] for i in which], structs.take(choice, which), engine)
+            for i, instance in enumerate(rows):
+                _remember(instance, (scene.shape[i], poses[i]), structs.take(choice, i))
+                _doubt(instance, (scene.shape[i], poses[i]), choice.grasp_pixel[i])
+                instance.ended = instance.ended or _ended(instance)
+            partial.save(instances)
+            removed = sum(instance.removed for instance in instances) - before
+            done = sum(bool(instance.ended) for instance in instances)
+            progress.advance(removed, f"{done}/{len(instances)} tables ended")
+    return instances
+
+
+def _push(rows: list[Instance], choice: Choice, engine: Engine, *, longest: float) -> None:
+    scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
+    rollout = primitives.push(engine, scene, poses, choice.push, longest=longest)
+    wrong = ~Fault.usable(rollout.fault)
+    for i, instance in enumerate(rows):
+        instance.pushes += 1
+        instance.ended = "fault" if wrong[i] else ""
+        instance.poses = np.asarray(rollout.poses)[i, -1]
+        instance.did.append("push")
+
+
+def _grasp(rows: list[Instance], choice: Choice, engine: Engine) -> None:
+    scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
+    scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, choice.grasp)
+    wrong = ~Fault.usable(fault)
+    for i, instance in enumerate(rows):
+        instance.grasps += 1
+        instance.held += bool(held[i].any())
+        instance.ended = "fault" if wrong[i] else ""
+        instance.removed += int(held[i].sum())
+        instance.scene, instance.poses = structs.take(scene, i), rested[i]
+        instance.did.append("grasp held" if held[i].any() else "grasp missed")
+
+
+def _remember(instance: Instance, state: tuple[np.ndarray, np.ndarray], choice: Choice) -> None:
+    """Keep what a frame can be drawn from again: where everything was, and what was decided."""
+    push = choice.push
+    instance.film.append(
+        {
+            "shape": state[0],
+            "poses": state[1],
+            "push": np.array([*push.start, push.angle, push.distance], np.float32),
+            "grasp": choice.grasp_pixel,
+            "values": choice.values.astype(np.float32),
+            "motion": choice.motion.astype(np.float32),
+        }
+    )
+
+
+def _missed(instance: Instance) -> np.ndarray:
+    """The grasps that are doubted, padded: `[MISSES, 3]`."""
+    return np.stack([*instance.missed, *[planner.NONE_MISSED[0]] * (MISSES - len(instance.missed))])
+
+
+def _doubt(instance: Instance, state: tuple[np.ndarray, np.ndarray], grasp: np.ndarray) -> None:
+    """Keep in mind a grasp that missed, and forget those around which something has moved or is gone."""
+    shape, poses = state
+    missed = instance.missed + ((grasp,) if instance.did[-1] == "grasp missed" else ())
+    stayed = np.linalg.norm(instance.poses[:, :2] - poses[:, :2], axis=-1) < STAYED
+    moved = poses[(shape >= 0) & ~(stayed & (instance.scene.shape >= 0)), :2]
+    apart = [np.linalg.norm(moved - np.asarray(geometry.pixels_to_metres(each[:0:-1])), axis=-1) for each in missed]
+    instance.missed = tuple(each for each, away in zip(missed, apart, strict=True) if (away > AROUND).all())[-MISSES:]
+
+
+def _ended(instance: Instance) -> str:
+    present = instance.scene.shape >= 0
+    if (np.abs(instance.poses[present, :2]) > WORKSPACE.half).any():
+        return "pushed out"
+    if not present.any():
+        return "cleared"
+    return "out of actions" if instance.actions >= ACTIONS_PER_OBJECT * instance.objects else ""
+
+
+def summary(instances: list[Instance]) -> dict[str, Any]:
+    """Flat metrics, each with a bootstrap 95 % interval over instances (`_low`, `_high`).
+
+    As in the paper: completion is instances cleared over instances, grasp success is objects grasped over grasp
+    actions, efficiency is objects removed over all actions; the last two over all instances and over completed ones,
+    summed before they are divided. A grasp may lift two objects, so `grasps_that_held` stands beside.
+    """
+    done = np.array([instance.ended == "cleared" for instance in instances])
+    removed = np.array([instance.removed for instance in instances])
+    held = np.array([instance.held for instance in instances])
+    grasps = np.array([instance.grasps for instance in instances])
+    actions = np.array([instance.actions for instance in instances])
+    rows = {
+        "completion": (done, np.ones(len(done))),
+        "grasp_success_all": (removed, grasps),
+        "grasp_success_completed": (removed * done, grasps * done),
+        "grasps_that_held": (held, grasps),
+        "efficiency_all": (removed, actions),
+        "efficiency_completed": (removed * done, actions * done),
+    }
+    result: dict[str, Any] = {}
+    for name, (hits, trials) in rows.items():
+        value, low, high = metrics.ratio_interval(hits, trials)
+        result |= {name: value, f"{name}_low": low, f"{name}_high": high}
+    result |= {"instances": len(instances), "grasps": int(grasps.sum()), "pushes": int((actions - grasps).sum())}
+    for reason in ("cleared", "pushed out", "out of actions", "fault"):
+        result[f"ended_{reason.replace(' ', '_')}"] = sum(instance.ended == reason for instance in instances)
+    return result
+
+
+def save(instances: list[Instance], out: pathlib.Path) -> None:
+    """Every step of every instance, as `episodes/NUMBER.npz` (see `eval.film`), and a list of them, `episodes.json`."""
+    lines = []
+    for number, instance in enumerate(instances):
+        stem = f"{number:03d}"
+        film.save(out / "episodes" / f"{stem}.npz", instance)
+        lines.append(
+            {
+                "name": instance.name,
+                "file": f"episodes/{stem}.npz",
+                "ended": instance.ended,
+                "objects": instance.objects,
+                "removed": instance.removed,
+                "grasps": instance.grasps,
+                "pushes": instance.pushes,
+            }
+        )
+    files.write_json(out / "episodes.json", lines)

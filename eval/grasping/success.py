@@ -1,0 +1,211 @@
+"""How often does the best-scored grasp hold, until tables are empty? And does a score mean what it says?"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import matplotlib
+
+matplotlib.use("agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from dipn_jax import batching, console, structs
+from dipn_jax.engine import Engine
+from dipn_jax.planning import candidates
+from dipn_jax.planning.planner import Scorer
+from dipn_jax.sight import render
+from dipn_jax.sight.fingers import label_image
+from dipn_jax.storage import resume
+from dipn_jax.structs import Fault, Grasp, Scene
+from dipn_jax.world import clutter, primitives
+from dipn_jax.world.scenes import SceneConfig
+
+from .. import metrics
+from ..clearing import instances, lockstep, methods
+from ..clearing.instances import Instance
+
+BINS = 10
+
+
+def evaluate(
+    scorer: Scorer,
+    engine: Engine,
+    config: SceneConfig,
+    partial: resume.Partial,
+    *,
+    scenes: int,
+    seed: int,
+    others: int = 0,
+) -> tuple[dict[str, Any], list[Instance]]:
+    """Grasp greedily until every table is empty, by the end rules of `eval.clearing`; a random grasp on each besides.
+
+    Args:
+      scorer: scores of every grasp.
+      engine: physics.
+      config: scenes.
+      partial: where an interrupted evaluation is kept.
+      scenes: how many tables.
+      seed: of the scenes and of the random grasps.
+      others: where a grasp missed, try so many others of the best, each from the same state; 0: none.
+
+    Returns:
+      Flat metrics: success with bootstrap 95 % intervals over tables, calibration; and the tables, ended.
+    """
+    tables = instances.random_instances(engine, config, count=scenes, seed=seed)
+    result = _random_foreground(scorer, engine, tables, seed)
+    tables = lockstep.clear(tables, engine, methods.best_grasp(scorer, slots=config.slots), partial, seed=seed)
+    held = [np.array([did == "grasp held" for did in table.did], float) for table in tables]
+    scores = np.concatenate([[step["values"][0] for step in table.film] for table in tables])
+    result |= _rate("gn", [each.sum() for each in held], [len(each) for each in held])
+    result |= _rate("gn_first", [each[0] for each in held], [1] * len(held))
+    result |= {f"table/{key}": value for key, value in lockstep.summary(tables).items() if key.startswith("ended_")}
+    result |= {"attempts": len(scores), "scenes": scenes}
+    result |= calibration(scores, np.concatenate(held))
+    if others:
+        result |= _other_grasps(scorer, engine, tables, others)
+    return result, tables
+
+
+def _rate(name: str, hits: Any, trials: Any) -> dict[str, float]:
+    value, low, high = metrics.ratio_interval(hits, trials)
+    return {f"grasp_success/{name}": value, f"grasp_success/{name}_low": low, f"grasp_success/{name}_high": high}
+
+
+def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], seed: int) -> dict[str, Any]:
+    """A grasp of a random foreground pixel at a random angle on each table, and what the scorer thinks of it."""
+    scene = structs.stack([table.scene for table in tables])
+    poses = np.stack([table.poses for table in tables])
+    keys = jax.random.split(jax.random.key(seed), len(tables))
+    grasps, scores = batching.in_chunks(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
+    rollout, outcome = primitives.grasp(engine, scene, poses, jax.device_get(grasps))
+    good = Fault.usable(rollout.fault)
+    success = np.asarray(outcome.success, float)[good]
+    found = calibration(np.asarray(scores)[good], success)
+    return _rate("random_foreground", success, np.ones(len(success))) | {f"random/{k}": v for k, v in found.items()}
+
+
+@functools.partial(jax.jit, static_argnames="scorer")
+def _random_grasp(keys: jax.Array, scene: Scene, poses: jax.Array, *, scorer: Scorer) -> tuple[Grasp, jax.Array]:
+    def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Grasp, jax.Array]:
+        seen = render.render(*args[1:])
+        grasps = candidates.random_grasps(args[0], seen, count=1)
+        chosen: Grasp = jax.tree.map(lambda leaf: leaf[0], grasps)
+        rotation, row, col = candidates.grasp_index(chosen)
+        return chosen, scorer(render.rgbd(seen)[None])[0, rotation, row, col]
+
+    return jax.lax.map(one, (keys, scene, poses))
+
+
+def _other_grasps(scorer: Scorer, engine: Engine, tables: list[Instance], count: int) -> dict[str, float]:
+    """Where GN missed: would one of the next best grasps, 16 mm apart, have held? The ceiling that physics sets."""
+    states = [
+        (t.scene.replace(shape=s["shape"]), s["poses"])
+        for t in tables
+        for s, d in zip(t.film, t.did, strict=True)
+        if d == "grasp missed"
+    ]
+    result: dict[str, float] = {"other_grasps/missed": len(states), "other_grasps/tried_each": count}
+    if not states:
+        return result
+    scene, poses = structs.stack([state[0] for state in states]), np.stack([state[1] for state in states])
+    grasps = batching.in_chunks(functools.partial(_next_best, scorer=scorer, count=count), scene, poses)
+    flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
+    index = np.repeat(np.arange(len(states)), count)
+    held, begin = [], 0
+    with console.Progress("other grasps", len(index), unit="grasps") as progress:
+        while begin < len(index):
+            rows = slice(begin, begin + engine.batch)
+            rollout, outcome = primitives.grasp(
+                engine, structs.take(scene, index[rows]), poses[index[rows]], structs.take(flat, rows)
+            )
+            held.append(np.asarray(outcome.success) & Fault.usable(rollout.fault))
+            begin += engine.batch
+            progress.advance(len(held[-1]), "")
+    any_held = np.concatenate(held).reshape(-1, count).any(1)
+    attempts = sum(len(table.did) for table in tables)
+    result["other_grasps/one_holds"] = float(any_held.mean())
+    result["other_grasps/ceiling"] = 1 - float((~any_held).sum()) / attempts
+    return result
+
+
+@functools.partial(jax.jit, static_argnames=("scorer", "count"))
+def _next_best(scene: Scene, poses: jax.Array, *, scorer: Scorer, count: int) -> Grasp:
+    def one(args: tuple[Scene, jax.Array]) -> Grasp:
+        seen = render.render(*args)
+        scores = scorer(render.rgbd(seen)[None])[0]
+        best = candidates.best_grasps(scores, count=count + 1)[1:]  # without the one that missed
+        return candidates.grasp_at(best, seen.height)
+
+    return jax.lax.map(one, (scene, poses))
+
+
+def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: int, each: int = 4) -> dict[str, float]:
+    """How often the labels of pre-training say what physics says, of random grasps of the foreground.
+
+    Args:
+      engine: physics.
+      config: scenes; one object in each to see what the rule is worth by itself.
+      scenes: how many.
+      seed: of scenes and grasps.
+      each: grasps on every scene.
+    """
+    items = clutter.settled_exactly(jax.random.key(seed), engine, config, scenes)
+    keys = jax.random.split(jax.random.key(seed), scenes)
+    grasps, labels = batching.in_chunks(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
+    flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
+    index = np.repeat(np.arange(scenes), each)
+    rollout, outcome = primitives.grasp(engine, structs.take(items.scene, index), items.poses[index], flat)
+    good = Fault.usable(rollout.fault)
+    said, held = np.asarray(labels).reshape(-1)[good] > 0.5, np.asarray(outcome.success)[good]
+    rates = {"agree": said == held, "positive_holds": held[said], "negative_fails": ~held[~said], "positive": said}
+    return {"grasps": len(said)} | {name: float(np.mean(rate)) for name, rate in rates.items()}
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _labelled(keys: jax.Array, scene: Scene, poses: jax.Array, *, count: int) -> tuple[Grasp, jax.Array]:
+    def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Grasp, jax.Array]:
+        seen = render.render(*args[1:])
+        grasps = candidates.random_grasps(args[0], seen, count=count)
+        rotation, row, col = candidates.grasp_index(grasps).T
+        return grasps, label_image(seen.height)[rotation, row, col]
+
+    return jax.lax.map(one, (keys, scene, poses))
+
+
+def calibration(scores: np.ndarray, success: np.ndarray) -> dict[str, float]:
+    """Expected calibration error over ten equal bins of score (Naeini et al. 2015), and the bins.
+
+    Args:
+      scores: `[A]` in [0, 1].
+      success: `[A]` 0 or 1.
+    """
+    bins = np.clip((scores * BINS).astype(int), 0, BINS - 1)
+    result: dict[str, float] = {}
+    error = 0.0
+    for b in range(BINS):
+        inside = bins == b
+        if inside.any():
+            said, came = float(scores[inside].mean()), float(success[inside].mean())
+            error += float(inside.mean()) * abs(came - said)
+            result |= {f"reliability/{b}/count": int(inside.sum()), f"reliability/{b}/score": said}
+            result[f"reliability/{b}/success"] = came
+    return {"expected_calibration_error": error, **result}
+
+
+def reliability_figure(values: dict[str, Any]) -> Any:
+    """Success against score: the grasps that GN chose, and random ones."""
+    figure, axis = plt.subplots(figsize=(4.2, 4))
+    axis.plot([0, 1], [0, 1], color="grey", lw=1)
+    for prefix, label in (("", "chosen by GN"), ("random/", "random")):
+        found = [b for b in range(BINS) if f"{prefix}reliability/{b}/count" in values]
+        points = [[values[f"{prefix}reliability/{b}/{key}"] for b in found] for key in ("score", "success", "count")]
+        label += f", ECE {values[f'{prefix}expected_calibration_error']:.3f}"
+        axis.plot(points[0], points[1], marker="o", label=label)
+        for x, y, n in zip(*points, strict=True):
+            axis.annotate(str(int(n)), (x, y), fontsize=6, xytext=(3, -8), textcoords="offset points")
+    axis.set(xlabel="score", ylabel="share that held", xlim=(0, 1), ylim=(0, 1.02))
+    axis.legend(fontsize=8)
+    return figure

@@ -1,0 +1,197 @@
+"""Methods side by side: tables beside the paper's, why tables were not cleared, and films of some."""
+
+from __future__ import annotations
+
+import html
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from dipn_jax import files
+
+from .. import drawing, metrics
+from ..clearing import film, lockstep
+from . import paper
+
+FRAMES = 10
+"""Pictures of a film."""
+FILM_ROWS = 4
+CAUSES = {
+    "cleared": "cleared",
+    "pushed out": "pushed out of the workspace",
+    "thrown out": "thrown out by a grasp",
+    "out of actions": "more than three actions an object",
+    "fault": "the simulation went wrong",
+}
+
+
+class Cleared:
+    """The folder of a `dipn-eval clear`."""
+
+    def __init__(self, folder: pathlib.Path) -> None:
+        self.folder = folder
+        self.values = metrics.read(folder)
+        settings = files.read_json(folder / "settings.json")
+        self.method, self.label = settings["method"], settings["label"]
+        cases = settings["tables.cases"]
+        self.tables = _tables_name(cases, settings["tables.objects"])
+        self.episodes = files.read_json(folder / "episodes.json", wanted=list)
+
+    @property
+    def name(self) -> str:
+        """Of the method, and what sets it apart."""
+        return f"{self.method} ({self.label})" if self.label else self.method
+
+
+def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
+    """`clear/TABLES/METHOD/...` for the report's metrics; `clear/TABLES/LABEL/METHOD/...` where there is a label."""
+    values: dict[str, Any] = {}
+    for one in all_cleared:
+        at = "/".join(filter(None, ("clear", one.tables, one.label, one.method)))
+        values |= {f"{at}/{key}": value for key, value in one.values.items()}
+    return values
+
+
+def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
+    """HTML with places for figures, and the figures by name."""
+    parts, figures = ["<h2>Clearing tables</h2>"], {}
+    for tables in dict.fromkeys(one.tables for one in all_cleared):
+        rows = [one for one in all_cleared if one.tables == tables]
+        parts.append(f"<h3>{html.escape(tables)}</h3>{_table(rows, paper.TABLE.get(tables, {}))}")
+        parts.append(f"<p>Why tables were not cleared:</p>{_causes(rows)}{{course-{tables}}}")
+        figures[f"course-{tables}"] = _courses(rows)
+        for number, one in enumerate(rows):
+            place = f"clear-{tables}-{number}"
+            figures[place] = _films(one)
+            parts.append(
+                f"<h4>{html.escape(one.name)} on {html.escape(tables)}: the best, the median and the worst table</h4>"
+                f"{{{place}}}"
+            )
+    parts.append(
+        "<p class=note>Per cent, with bootstrap 95 % intervals over tables; the numbers of the paper are of its own "
+        "simulator, robot and objects.</p><h2>What was seen, chosen, imagined, and what happened</h2>"
+        "<p>Pushes first: the scene with the chosen action; the image predicted for the best push, with the values "
+        "compared (gamma times the mean grasp score on it, and the mean score now); the scene after.</p>{steps}"
+    )
+    figures["steps"] = _steps(all_cleared)
+    return "".join(parts), figures
+
+
+def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> str:
+    head = ["", "tables", "grasps", "pushes", *[f"{column.replace('_', ' ')} %" for column in paper.COLUMNS]]
+    lines = []
+    for one in rows:
+        counts = [str(one.values[key]) for key in ("instances", "grasps", "pushes")]
+        lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in paper.COLUMNS]])
+    for method, numbers in published.items():
+        lines.append([f"{method}, the paper", "", "", "", *[f"{number:.1f}" for number in numbers]])
+    return drawing.table(head, lines)
+
+
+def _cause(one: Cleared, entry: dict[str, Any]) -> str:
+    """Why a table ended, of CAUSES: an object leaves the workspace at a push or at a grasp."""
+    ended = str(entry["ended"])
+    grasped = ended == "pushed out" and str(film.load(one.folder / entry["file"]).what[-1]) != "push"
+    return "thrown out" if grasped else ended
+
+
+def _tables_name(cases: str, objects: str) -> str:
+    """What a table of results is called: the hard instances, random-N, or a case file of the user's own."""
+    if cases in ("hard", "random"):
+        return cases if cases == "hard" else f"random-{objects}"
+    stem = pathlib.Path(cases).stem
+    return f"own-{stem}" if stem in paper.TABLE else stem
+
+
+def _causes(rows: list[Cleared]) -> str:
+    """How every table ended, and on which cases it was not cleared."""
+    lines = []
+    for one in rows:
+        causes = [_cause(one, entry) for entry in one.episodes]
+        counts = [str(causes.count(cause)) for cause in CAUSES]
+        failed = [entry["name"] for entry in one.episodes if entry["ended"] != "cleared"]
+        where = ", ".join(f"{name} ({failed.count(name)})" for name in sorted(set(failed)))
+        lines.append([one.name, *counts, where or "-"])
+    return drawing.table(["", *CAUSES.values(), "not cleared"], lines)
+
+
+def course(one: Cleared, at: np.ndarray) -> np.ndarray:
+    """Share of objects that are left after `at [A]` actions an object, the mean over tables: `[A]`."""
+    shares = []
+    for entry in one.episodes:
+        left = (film.load(one.folder / entry["file"]).shape >= 0).sum(1) / entry["objects"]
+        shares.append(np.interp(at * entry["objects"], np.arange(len(left)), left))
+    return np.mean(shares, axis=0)
+
+
+def _courses(rows: list[Cleared]) -> Any:
+    """How tables empty."""
+    figure, axis = plt.subplots(figsize=(6, 3.5))
+    at = np.linspace(0, lockstep.ACTIONS_PER_OBJECT, 61)
+    for one in rows:
+        axis.plot(at, 100 * course(one, at), label=one.name)
+    axis.plot(at, 100 * np.maximum(1 - at, 0), color="0.7", lw=1, ls=":", label="an object an action")
+    axis.set(xlabel="actions an object", ylabel="objects left, %", ylim=(0, 102))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=7)
+    return figure
+
+
+def _films(one: Cleared) -> Any:
+    """Filmstrips of the best, median and worst table, by how many objects an action removed."""
+
+    def quality(entry: dict[str, Any]) -> tuple[bool, float]:
+        return entry["ended"] == "cleared", entry["removed"] / max(entry["grasps"] + entry["pushes"], 1)
+
+    ranked = sorted(one.episodes, key=quality, reverse=True)
+    chosen = [ranked[0], ranked[len(ranked) // 2], ranked[-1]]
+    figure, axes = plt.subplots(3, FRAMES, figsize=(1.5 * FRAMES, 5.4), squeeze=False)
+    for row, (which, entry) in enumerate(zip(("best", "median", "worst"), chosen, strict=True)):
+        reel = film.load(one.folder / entry["file"])
+        steps = np.unique(np.linspace(0, len(reel.what) - 1, FRAMES).round().astype(int))
+        for axis in axes[row]:
+            axis.axis("off")
+        for axis, i in zip(axes[row], steps, strict=False):
+            axis.axis("on")
+            drawing.show(axis, reel.before(i), f"{i + 1}: {reel.what[i]}")
+            _draw(axis, reel, i)
+        axes[row, 0].set_ylabel(f"{which}: {entry['name']}\n{entry['ended']}", fontsize=8)
+    figure.tight_layout(pad=0.4)
+    return figure
+
+
+def _draw(axis: Any, reel: film.Film, step: int) -> None:
+    if reel.what[step] == "push":
+        drawing.arrow(axis, reel.push[step])
+    else:
+        drawing.jaws(axis, reel.grasp[step])
+
+
+def _steps(all_cleared: list[Cleared]) -> Any:
+    """Some steps with what was predicted: pushes first, of whoever imagines."""
+    steps = []
+    for one in sorted(all_cleared, key=lambda one: one.method != "dipn+gn"):
+        for entry in one.episodes:
+            reel = film.load(one.folder / entry["file"])
+            steps += [(entry["name"], i, reel) for i in range(len(reel.what))]
+    steps.sort(key=lambda step: (str(step[2].what[step[1]]) != "push", step[1]))
+    chosen = steps[:FILM_ROWS]
+    figure, axes = plt.subplots(len(chosen), 3, figsize=(7.5, 2.7 * len(chosen)), squeeze=False)
+    for row, (name, i, reel) in enumerate(chosen):
+        before, predicted, after = reel.pictures(i)
+        score, now, push = reel.values[i]
+        drawing.show(axes[row, 0], before, f"{name}, action {i + 1}: {reel.what[i]}")
+        _draw(axes[row, 0], reel, i)
+        if reel.what[i] == "push":
+            title = f"predicted: {push:.4f} > {now:.4f}"
+        else:
+            considered = np.isfinite(push)
+            title = (
+                f"best push, not taken: {push:.4f} < {now:.4f}" if considered else f"no push; grasp score {score:.2f}"
+            )
+        drawing.show(axes[row, 1], predicted, title)
+        drawing.show(axes[row, 2], after, "what happened")
+    return figure

@@ -1,0 +1,155 @@
+"""The report: one HTML file with its pictures inside, and the numbers of several evaluations in one `metrics.json`."""
+
+from __future__ import annotations
+
+import html
+import json
+import pathlib
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from dipn_jax import files
+from dipn_jax.errors import UserError
+
+from .. import drawing, metrics
+from ..clearing import sweeping
+from . import comparison
+
+FILM_ROWS = 4
+_STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
+table{border-collapse:collapse;margin:1em 0}td,th{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:right}
+td:first-child,th:first-child{text-align:left}img{max-width:100%}h2{margin-top:2em}.note{color:#666}"""
+
+
+def write(
+    out: pathlib.Path,
+    *,
+    prediction: pathlib.Path | None,
+    grasp: pathlib.Path | None,
+    clears: list[pathlib.Path],
+    sweep: pathlib.Path | None,
+    runs: list[pathlib.Path],
+) -> dict[str, Any]:
+    """Read everything, then write `report.html`, its pictures and `metrics.json`; returns the merged metrics.
+
+    Args:
+      out: folder.
+      prediction: folder of `dipn-eval prediction`.
+      grasp: folder of `dipn-eval grasp`.
+      clears: folders of `dipn-eval clear`.
+      sweep: folder of `dipn-eval sweep`.
+      runs: training runs.
+
+    Raises:
+      UserError: a folder lacks what its command writes.
+    """
+    values: dict[str, Any] = {}
+    parts: list[str] = []
+    figures: dict[str, Any] = {}
+    try:
+        if clears:
+            cleared = [comparison.Cleared(folder) for folder in clears]
+            values |= comparison.flat(cleared)
+            part, more = comparison.section(cleared)
+            parts.append(part)
+            figures |= more
+        if sweep:
+            values |= metrics.read(sweep)
+            figures["sweep"] = sweeping.figure(values)
+            parts.append(f"<h2>Push distance</h2>{sweeping.table(values)}{{sweep}}")
+        if prediction:
+            values |= metrics.read(prediction)
+            figures["prediction"] = _prediction_film(_load(prediction / "films.npz"))
+            parts.append(_prediction_section(values))
+        if grasp:
+            values |= metrics.read(grasp)
+            parts.append(_grasp_section(values))
+        if runs:
+            figures["curves"] = _curves(runs)
+            parts.append("<h2>Learning curves</h2>{curves}")
+    except (KeyError, TypeError) as error:
+        raise UserError(f"report: a folder lacks {error}; give the folders that dipn-eval wrote") from None
+    if not parts:
+        raise UserError("report: nothing to report; give --prediction, --grasp, --clear, --sweep or --runs")
+    body = "".join(parts)
+    for name, figure in figures.items():
+        body = body.replace(f"{{{name}}}", drawing.image(figure, out / "pictures" / f"{name}.png"))
+    versions = ", ".join(f"{k} {v}" for k, v in files.package_versions().items())
+    page = (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>dipn-jax report</title><style>{_STYLE}</style>'
+        f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {html.escape(versions)}.</p></html>\n'
+    )
+    files.write_atomically(out / "report.html", page.encode())
+    files.write_json(out / "metrics.json", values)
+    return values
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _prediction_section(values: dict[str, Any]) -> str:
+    rows = []
+    for name in ("dipn", "static", "trans", "physics"):
+        if f"push_error/{name}/5cm/all" not in values:
+            continue
+        cells = [
+            _figure(values.get(f"{measure}/{name}/{distance}/{which}"))
+            for measure in ("push_error", "push_error_paper_measure")
+            for distance in ("5cm", "10cm")
+            for which in ("all", "moved")
+        ]
+        rows.append([name, *cells])
+    head = ["", *[f"{m} {d} {w}" for m in ("1-IoU", "XOR/2") for d in ("5 cm", "10 cm") for w in ("all", "moved")]]
+    return (
+        f"<h2>Predicting a push</h2><p>{values['pushes']} held-out pushes, {values['objects']} objects in sight, "
+        f"{values['objects_moved/5cm']} moved after 5 cm.</p>{drawing.table(head, rows)}{{prediction}}"
+    )
+
+
+def _grasp_section(values: dict[str, Any]) -> str:
+    rows = [[name, drawing.percent(values, f"grasp_success/{name}")] for name in ("gn", "random_foreground")]
+    return (
+        f"<h2>Grasping</h2><p>{values['attempts']} grasps by GN until {values['scenes']} tables were empty, and "
+        f"a random one on each; expected calibration error {values['expected_calibration_error']:.3f}.</p>"
+        f"{drawing.table(['', 'success %'], rows)}"
+    )
+
+
+def _load(path: pathlib.Path) -> Any:
+    try:
+        return np.load(path)
+    except (OSError, ValueError):
+        raise UserError(f"{path}: missing or damaged; run the dipn-eval command that writes it again") from None
+
+
+def _prediction_film(films: Any) -> Any:
+    count = min(FILM_ROWS, len(films["before"]))
+    figure, axes = plt.subplots(count, 3, figsize=(7.5, 2.5 * count), squeeze=False)
+    for row in range(count):
+        drawing.show(axes[row, 0], films["before"][row], "before, push" if row == 0 else "")
+        drawing.arrow(axes[row, 0], films["push"][row])
+        drawing.show(axes[row, 1], films["predicted"][row], "predicted" if row == 0 else "")
+        drawing.show(axes[row, 2], films["after"][row], "after" if row == 0 else "")
+    return figure
+
+
+def _curves(runs: list[pathlib.Path]) -> Any:
+    figure, axes = plt.subplots(1, len(runs), figsize=(4 * len(runs), 3), squeeze=False)
+    for axis, run in zip(axes[0], runs, strict=True):
+        try:
+            lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        except (OSError, json.JSONDecodeError):
+            raise UserError(f"{run}: no readable metrics.jsonl; give the --out of a dipn-train command") from None
+        for key in dict.fromkeys(k for line in lines for k in line if k != "step"):
+            some = [line for line in lines if key in line]
+            axis.plot([line["step"] for line in some], [line[key] for line in some], marker=".", label=key)
+        axis.set(title=run.name, xlabel="steps", yscale="log")
+        axis.legend(fontsize=7)
+        axis.grid(alpha=0.3)
+    return figure
