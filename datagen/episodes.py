@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -43,7 +42,6 @@ def push_batch(
     count: int,
     actions: int,
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,),
-    **_: Any,
 ) -> Batch:
     """`actions` different pushes on each of up to `count` settled scenes, each once for every one of `distances`."""
     drop, aim = jax.random.split(key)
@@ -98,7 +96,6 @@ def grasp_batch(
     count: int,
     actions: int,
     guide: Guide | None = None,
-    **_: Any,
 ) -> Batch:
     """`actions` grasps on each of up to `count` settled scenes: at random foreground pixels and angles, or guided."""
     drop, aim = jax.random.split(key)
@@ -111,13 +108,13 @@ def grasp_batch(
     repeated = structs.take(items, np.repeat(np.arange(n), actions))
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
     episodes = GraspEpisode(
-        repeated.scene,
-        repeated.poses,
-        np.asarray(rollout.poses)[:, -1],
-        grasps,
-        np.asarray(outcome.held),
-        np.asarray(outcome.success),
-        np.asarray(rollout.fault),
+        scene=repeated.scene,
+        poses=repeated.poses,
+        after=np.asarray(rollout.poses)[:, -1],
+        grasp=grasps,
+        held=np.asarray(outcome.held),
+        success=np.asarray(outcome.success),
+        fault=np.asarray(rollout.fault),
     )
     return _drop_unusable(episodes, counts)
 
@@ -140,7 +137,7 @@ def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
     return jax.lax.map(one, (keys, scene, poses))
 
 
-def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int, **_: Any) -> Batch:
+def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int) -> Batch:
     """Settled scenes, nothing done to them."""
     items, counts = clutter.settled(key, engine, config, count)
     return Batch(items if len(items.fault) else None, counts)
@@ -152,6 +149,3 @@ def _drop_unusable(episodes: Any, counts: dict[str, int], *, together: int = 1) 
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})
     good = Fault.usable(fault).reshape(-1, together).all(-1).repeat(together)
     return Batch(structs.take(episodes, good) if good.any() else None, counts)
-
-
-MAKERS: dict[str, Callable[..., Batch]] = {"push": push_batch, "grasp": grasp_batch, "images": image_batch}

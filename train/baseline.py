@@ -10,19 +10,18 @@ import functools
 import json
 import pathlib
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import nnx
 
 from dipn_jax import files, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
-from dipn_jax.networks.vpg import VpgConfig
+from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Grasp, GraspEpisode
@@ -30,37 +29,22 @@ from dipn_jax.world.scenes import SceneConfig
 
 from . import acting, tables
 from .acting import Look
+from .configs import BaselineConfig
 from .grasp import PHASE, WINDOWS, Window, view, windows
-from .loop import make_step
+from .loop import constant_adamw, make_step
 from .rounds import Run
 
-MethodName = Literal["vpg", "rea", "dqn"]
 PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
 """What each method learns: REA+DIPN uses REA's grasps only, DQN+GN has GN for its grasps."""
 DISTANCE = 0.10
 """Metres of a push."""
 RECENT = 100
-"""Actions over which the success of the moment is counted."""
-
-
-@dataclasses.dataclass(frozen=True)
-class BaselineConfig:
-    """How to learn."""
-
-    method: MethodName = "vpg"
-    preset: str = "compact"
-    actions: int = 2500
-    tables: int = 10
-    updates: int = 10  # optimizer steps after each round of one action a table
-    batch: int = 32
-    learning_rate: float = 5e-4
-    weight_decay: float = 1e-4
-    seed: int = 0
+"""The number of last actions over which rewards are averaged."""
 
 
 @dataclasses.dataclass
 class State:
-    """Everything that a run is at a moment."""
+    """Everything that an interrupted run needs to continue."""
 
     params: Any
     rest: Any  # of the network: batch statistics
@@ -74,7 +58,7 @@ class State:
 
 
 class _Outcomes:
-    """What `make_step` wants to know of a task: one batch of windows for each part of the network."""
+    """The part of a task that `make_step` needs: one batch of windows for each part of the network."""
 
     def __init__(self, answers: str) -> None:
         self.answers = answers
@@ -101,15 +85,15 @@ def learn(
     scorer: Scorer | None = None,
     scored_by: str = "",
 ) -> dict[str, float]:
-    """Learn in the folder `out`; a run that was interrupted goes on.
+    """Learn in the folder `out`; a run that was interrupted continues.
 
     Args:
       engine: physics.
       scenes: what tables are made of.
       config: how.
       out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
-      scorer: GN, whose grasps `dqn` takes.
-      scored_by: what tells this GN from another: a digest of its weights.
+      scorer: GN, whose grasps `dqn` executes.
+      scored_by: digest of its weights.
 
     Returns:
       Mean reward of all and of the last pushes and grasps.
@@ -121,8 +105,7 @@ def learn(
         raise UserError(
             f"baseline: --method {config.method} takes {'a' if config.method == 'dqn' else 'no'} --grasp-net"
         )
-    answers = "chance" if config.method == "rea" else "value"
-    network = VpgConfig(config.preset, PARTS[config.method], answers)
+    network = VpgConfig(config.preset, PARTS[config.method], "chance" if config.method == "rea" else "value")
     model: Any = checkpoint.build("vpg", network, seed=config.seed)
     identity = {**dataclasses.asdict(config), "scenes": str(scenes), "engine": type(engine).__name__}
     identity |= {"grasp_net": scored_by} if scored_by else {}
@@ -130,11 +113,21 @@ def learn(
     ended = run.ended()
     if ended:
         return {name: value for name, value in ended.items() if name.startswith("reward/")}
+    state = _play(run, model, engine, scenes, config, scorer)
+    nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
+    result = _rewards(state.did, len(state.did)) | {f"{k}/recent": v for k, v in _rewards(state.did, RECENT).items()}
+    extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
+    run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
+    return result
+
+
+def _play(
+    run: Run, model: VPG, engine: Engine, scenes: SceneConfig, config: BaselineConfig, scorer: Scorer | None
+) -> State:
+    """Act and learn to the end of the run."""
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
-    )
-    step = make_step(_Outcomes(network.answers), graph, optimizer)
+    optimizer = constant_adamw(config)
+    step = make_step(_Outcomes(model.config.answers), graph, optimizer)
     weights, statistics = jax.device_get((params, rest))
 
     def fresh() -> State:
@@ -147,17 +140,12 @@ def learn(
         state.params, state.rest, state.moments = _update(state, step, config)
         return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT).items())
 
-    total, log = -(-config.actions // config.tables), functools.partial(_log, out, config)
-    state = run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
-    nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
-    result = _rewards(state.did, len(state.did)) | {f"{k}/recent": v for k, v in _rewards(state.did, RECENT).items()}
-    extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
-    run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
-    return result
+    total, log = -(-config.actions // config.tables), functools.partial(_log, run.out, config)
+    return run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
 
 
 def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneConfig, config: BaselineConfig) -> None:
-    """One action on every table, what came of it, and what it teaches."""
+    """Act once on every table; keep what happened and what it teaches."""
     count, before = config.tables, state.tables
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.round), (2, count))
     anew = np.ones(count, bool) if state.then is None else state.anew
@@ -182,7 +170,13 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
         if name in PARTS[config.method] and rows.any():
             aim = Grasp(centre, angle, np.zeros(count, np.float32))
             tried = GraspEpisode(
-                before.scene, before.poses, poses, aim, held, target.astype(np.float32), np.zeros(count, int)
+                scene=before.scene,
+                poses=before.poses,
+                after=poses,
+                grasp=aim,
+                held=held,
+                success=target.astype(np.float32),
+                fault=np.zeros(count, int),
             )
             taught = windows(structs.take(tried, rows), pixels=WINDOWS[config.preset] + 2 * PHASE)
             state.seen[name].append(taught)
@@ -217,7 +211,7 @@ def _rewards(did: list[tuple[str, float]], last: int) -> dict[str, float]:
 
 
 def _log(out: pathlib.Path, config: BaselineConfig, state: State) -> None:
-    """`metrics.jsonl`: after so many actions, the mean rewards of the last ones."""
+    """Write `metrics.jsonl`: the number of actions after each round, and mean rewards of the last of them."""
     counts = range(config.tables, len(state.did) + 1, config.tables)
     rows = [{"step": n, **_rewards(state.did[:n], RECENT)} for n in counts]
     files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())

@@ -4,33 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from dipn_jax import console
 from dipn_jax.engine import Engine, EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.physics import make_engine
-from dipn_jax.planning import policy
-from dipn_jax.storage import checkpoint, resume
-from dipn_jax.world import scenes
+from dipn_jax.planning.names import MethodName
 
-from .. import metrics, options
-from . import lockstep, methods, sweeping
-from .instances import Tables
+from .. import options
+from .tables import DEFAULT_TABLES, Tables
+
+if TYPE_CHECKING:
+    from . import methods
 
 MAX_CANDIDATES = 4096
-LONG = 0.10
-"""Metres of a push that are simulated at least: a shorter one is looked at when a long one has ended."""
-
-
-DEFAULT_TABLES = Tables()
+"""Pushes that may be considered at a time."""
+SIMULATED_PUSH = 0.10
+"""Metres of a push that are simulated at least: the table is looked at when a push of this length would have ended."""
 
 
 def clear(
     out: pathlib.Path,
-    method: methods.MethodName = "dipn+gn",
+    method: MethodName = "dipn+gn",
     push_net: pathlib.Path | None = None,
     grasp_net: pathlib.Path | None = None,
     value_net: pathlib.Path | None = None,
@@ -75,32 +72,44 @@ def clear(
       seed: of scenes, perturbations and candidates.
       engine: physics.
     """
-    settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
-    del settings["tables"]
-    plan = _plan(out, seed, method, candidates, (distance,), gamma, threshold, released)
-    plan = dataclasses.replace(plan, cautious=cautious, remember=remember)
+    settings = _settings(locals())
+    from dipn_jax.physics import make_engine
+
+    from . import methods
+
+    plan = methods.Plan(
+        method=method,
+        candidates=candidates,
+        distances=(distance,),
+        gamma=gamma,
+        threshold=threshold,
+        released=released,
+        cautious=cautious,
+        remember=remember,
+    )
+    _check(out, seed, plan)
     nets, physics = methods.Nets(push_net, grasp_net, value_net), make_engine(engine)
     decide = methods.load(plan, nets, physics, slots=tables.slots())
-    _cleared(out, decide, physics, tables, settings, nets.require(method), longest=max(distance, LONG))
+    longest = max(distance, SIMULATED_PUSH)
+    _clear(out, decide, physics, tables, settings=settings, runs=nets.require(method), longest=longest)
 
 
-def _plan(
-    out: pathlib.Path,
-    seed: int,
-    method: methods.MethodName,
-    candidates: int,
-    distances: tuple[float, ...],
-    gamma: float,
-    threshold: float,
-    released: bool,
-) -> methods.Plan:
-    """The plan of options that make sense."""
-    options.check(out, seed, candidates=candidates)
-    console.require_between(1, MAX_CANDIDATES, candidates=candidates)
-    for distance in distances:
+def _settings(given: dict[str, Any]) -> dict[str, Any]:
+    """The options of a command by name, those of its tables as `tables.NAME`."""
+    tables: Tables = given["tables"]
+    others = {key: value for key, value in given.items() if key != "tables"}
+    return others | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+
+
+def _check(out: pathlib.Path, seed: int, plan: methods.Plan) -> None:
+    """Refuse options that make no sense."""
+    from . import methods
+
+    options.check(out, seed, candidates=plan.candidates)
+    console.require_between(1, MAX_CANDIDATES, candidates=plan.candidates)
+    for distance in plan.distances:
         console.require_between(0.01, methods.LONGEST, distance=distance)
-    console.require_between(0.0, 10.0, gamma=gamma, threshold=threshold)
-    return methods.Plan(method, candidates, distances, gamma, threshold, released)
+    console.require_between(0.0, 10.0, gamma=plan.gamma, threshold=plan.threshold)
 
 
 def sweep(
@@ -134,54 +143,90 @@ def sweep(
       seed: of scenes, perturbations and candidates.
       engine: physics.
     """
-    settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
-    settings |= {"method": "dipn+gn", "label": ""}
-    del settings["tables"]
+    settings = _settings(locals()) | {"method": "dipn+gn", "label": ""}
+    from dipn_jax.physics import make_engine
+    from dipn_jax.storage import resume
+
+    from .. import metrics
+    from . import methods, sweeping
+
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
     if candidates < len(every):
         raise UserError(f"--candidates {candidates}: want at least one for each of the {len(every)} distances")
-    each = {sweeping.name(distance): (distance,) for distance in every} | {sweeping.CHOSEN: every}
-    plans = [_plan(out, seed, "dipn+gn", candidates, spread, gamma, threshold, False) for spread in each.values()]
-    nets = methods.Nets(push_net, grasp_net)
-    physics = make_engine(engine)
-    runs = nets.require("dipn+gn")
+    chosen = methods.Plan(candidates=candidates, distances=every, gamma=gamma, threshold=threshold)
+    _check(out, seed, chosen)
+    plans = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
+    plans[sweeping.CHOSEN] = chosen
+    nets, physics = methods.Nets(push_net, grasp_net), make_engine(engine)
+    runs = nets.require(chosen.method)
     kept = resume.Partial(out, settings, inputs=_inputs(runs, tables))
     ended: dict[str, dict[str, Any]] = kept.load({})
-    deciders = methods.load_each(plans, nets, physics, slots=tables.slots())
-    for name, decide in zip(each, deciders, strict=True):
+    deciders = methods.load_each(list(plans.values()), nets, physics, slots=tables.slots())
+    for name, decide in zip(plans, deciders, strict=True):
         if name not in ended:
             mine = settings | {"label": name}
-            ended[name] = _cleared(out / name, decide, physics, tables, mine, runs, longest=max(every))
+            ended[name] = _clear(out / name, decide, physics, tables, settings=mine, runs=runs, longest=max(every))
             kept.save(ended)
     values = {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
     if pushes:
-        predictor = policy.load_predictor(checkpoint.find(push_net, network="dipn"), scenes.PAPER.slots)
-        measure: dict[str, Any] = {"scenes": pushes, "seed": seed, "longest": max(every)}
-        values |= sweeping.prediction_errors(predictor, physics, scenes.PAPER, every, **measure)
+        values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
     sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
     metrics.write(out, values, settings={key: options.plain(value) for key, value in settings.items()})
     kept.finish()
     console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
 
 
+def _prediction_errors(
+    push_net: pathlib.Path, physics: Engine, distances: tuple[float, ...], *, scenes: int, seed: int
+) -> dict[str, float]:
+    """Errors of the predicted masks at each of `distances`, on `scenes` as published, one push each."""
+    from dipn_jax.planning import policy
+    from dipn_jax.storage import checkpoint
+    from dipn_jax.world.scenes import PAPER
+
+    from . import sweeping
+
+    predictor = policy.load_predictor(checkpoint.find(push_net, network="dipn"), PAPER.slots)
+    return sweeping.prediction_errors(
+        predictor, physics, PAPER, distances, scenes=scenes, seed=seed, longest=max(distances)
+    )
+
+
 def _inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]:
-    """What the course of things depends on, besides the options."""
+    """The runs and files that the results depend on, besides the options."""
     path = tables.path()
     return [*runs.values(), *([path] if path else [])]
 
 
-def _cleared(
+def _clear(
     out: pathlib.Path,
     decide: methods.Decider,
     physics: Engine,
     tables: Tables,
+    *,
     settings: dict[str, Any],
     runs: dict[str, pathlib.Path],
-    *,
     longest: float,
 ) -> dict[str, Any]:
-    """Clear tables and write what came of it; goes on where it was interrupted."""
+    """Clear tables and write the results; continues where it was interrupted.
+
+    Args:
+      out: folder of the results.
+      decide: decides on every table.
+      physics: physics.
+      tables: which tables.
+      settings: options, for `settings.json`.
+      runs: networks that `decide` uses.
+      longest: metres of the longest push.
+
+    Returns:
+      The metrics.
+    """
+    from dipn_jax.storage import resume
+
+    from . import lockstep
+
     seed = settings["seed"]
     partial = resume.Partial(out, settings, inputs=_inputs(runs, tables))
     ended = lockstep.clear(tables.make(physics, seed=seed), physics, decide, partial, seed=seed, longest=longest)

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import vpg
 from dipn_jax.planning import planner, policy
+from dipn_jax.planning.names import MethodName
 from dipn_jax.planning.planner import Rule
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint
@@ -25,7 +26,6 @@ from dipn_jax.structs import Array, Decision, Observation, Scene
 from . import choices, rollouts
 from .choices import Choice
 
-MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
 LONGEST = 0.12
 """Metres of a push at most."""
 UNIMAGINED = ("vpg", "dqn+gn")

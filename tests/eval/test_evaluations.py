@@ -12,6 +12,7 @@ from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import film, instances, lockstep, methods
 from dipn_jax.eval.grasping import success
 from dipn_jax.eval.prediction import push_errors
+from dipn_jax.eval.prediction.pushes import Executed
 from dipn_jax.eval.report import comparison, page
 from flax import nnx
 
@@ -115,11 +116,12 @@ def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> N
     seen = jax.tree.map(np.asarray, render.observe(settled.scene, settled.poses))
     truth = np.repeat(settled.poses[:, None], 3, 1)
     truth[:, 1:, 0, 0] += 0.01
-    after = push_errors._labels_after(settled.scene, truth)
     pushes = Push(np.zeros((6, 2), np.float32), np.zeros(6, np.float32), np.full(6, 0.05, np.float32))
     rows: push_errors.Rows = {}
-    static = {"static": push_errors._at_distances(policy.static_predictor(5))}
-    push_errors.measure(rows, "", static, seen, seen, pushes, truth, after, None)
+    static = {"static": push_errors.at_distances(policy.static_predictor(5))}
+    executed = Executed(settled, pushes, truth, None)
+    push_errors.measure(rows, executed, static, seen)
+    after = executed.labels_after
     for b in range(6):
         for i in range(5):
             was, is_ = seen.label[b] == i, after[b, 0] == i
