@@ -155,14 +155,14 @@ def _generate_guided(
     job: Job, out: pathlib.Path, work: Work, grasp_net: pathlib.Path, *, guided: float, hard: float
 ) -> None:
     """Generate grasps of which a network chooses the shares `guided` and `hard`."""
-    from dipn_jax.planning import policy
+    from dipn_jax.planning import scorers
     from dipn_jax.storage import checkpoint
 
     if not (guided >= 0 and hard >= 0 and 0 < guided + hard <= 1):
         raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
     network: Any = checkpoint.load_network(grasp_net, network="grasp")
     job = dataclasses.replace(job, guided=guided, hard=hard, weights=checkpoint.digest(network))
-    _generate(job, out, work, scorer=policy.grasp_scorer(network))
+    _generate(job, out, work, scorer=scorers.cautious_scorer(network))
 
 
 def images(

@@ -189,7 +189,7 @@ def baseline(
     console.require_positive(actions=config.actions)
     _check(out, config)
     from dipn_jax.physics import make_engine
-    from dipn_jax.planning import policy
+    from dipn_jax.planning import scorers
     from dipn_jax.storage import checkpoint
     from dipn_jax.world import scenes
 
@@ -201,7 +201,7 @@ def baseline(
         scenes.parse_objects(objects),
         config,
         out,
-        scorer=policy.grasp_scorer(gn) if gn else None,
+        scorer=scorers.cautious_scorer(gn) if gn else None,
         scored_by=checkpoint.digest(gn) if gn else "",
     )
     _say(out, result, digits=".3f")

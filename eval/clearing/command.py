@@ -17,7 +17,9 @@ from .. import options
 from .tables import DEFAULT_TABLES, Tables
 
 if TYPE_CHECKING:
-    from . import methods
+    from dipn_jax.planning.methods import PolicyConfig
+
+    from .on_tables import TablePolicy
 
 MAX_CANDIDATES = 4096
 """Pushes that may be considered at a time."""
@@ -74,24 +76,23 @@ def clear(
     """
     settings = _settings(locals())
     from dipn_jax.physics import make_engine
+    from dipn_jax.planning.methods import Networks, PolicyConfig
 
-    from . import methods
+    from . import on_tables
 
-    plan = methods.Plan(
-        method=method,
+    config = PolicyConfig(
         candidates=candidates,
         distances=(distance,),
         gamma=gamma,
-        threshold=threshold,
+        grasp_above=threshold,
         released=released,
         cautious=cautious,
-        remember=remember,
     )
-    _check(out, seed, plan)
-    nets, physics = methods.Nets(push_net, grasp_net, value_net), make_engine(engine)
-    decide = methods.load(plan, nets, physics, slots=tables.slots())
-    longest = max(distance, SIMULATED_PUSH)
-    _clear(out, decide, physics, tables, settings=settings, runs=nets.require(method), longest=longest)
+    _check(out, seed, config)
+    networks, physics = Networks(push_net, grasp_net, value_net), make_engine(engine)
+    (decide,) = on_tables.load(method, networks, physics, [config])
+    longest, runs = max(distance, SIMULATED_PUSH), networks.runs(method)
+    _clear(out, decide, physics, tables, settings=settings, runs=runs, longest=longest, remember=remember)
 
 
 def _settings(given: dict[str, Any]) -> dict[str, Any]:
@@ -101,15 +102,15 @@ def _settings(given: dict[str, Any]) -> dict[str, Any]:
     return others | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
 
 
-def _check(out: pathlib.Path, seed: int, plan: methods.Plan) -> None:
+def _check(out: pathlib.Path, seed: int, config: PolicyConfig) -> None:
     """Refuse options that make no sense."""
-    from . import methods
+    from dipn_jax.planning.methods import LONGEST_PUSH
 
-    options.check(out, seed, candidates=plan.candidates)
-    console.require_between(1, MAX_CANDIDATES, candidates=plan.candidates)
-    for distance in plan.distances:
-        console.require_between(0.01, methods.LONGEST, distance=distance)
-    console.require_between(0.0, 10.0, gamma=plan.gamma, threshold=plan.threshold)
+    options.check(out, seed, candidates=config.candidates)
+    console.require_between(1, MAX_CANDIDATES, candidates=config.candidates)
+    for distance in config.distances:
+        console.require_between(0.01, LONGEST_PUSH, distance=distance)
+    console.require_between(0.0, 10.0, gamma=config.gamma, threshold=config.grasp_above)
 
 
 def sweep(
@@ -132,7 +133,7 @@ def sweep(
 
     Args:
       out: folder for metrics.json and sweep.png, and in a folder for each distance what dipn-eval clear writes.
-      push_net: run of dipn-train push, or builtin; beyond 10 cm objects go on as in the last centimetre.
+      push_net: run of dipn-train push, or builtin; beyond 10 cm objects continue as in the last centimetre.
       grasp_net: run of dipn-train grasp, or builtin.
       distances: first:last:step, metres, to 0.12.
       tables: which.
@@ -145,25 +146,26 @@ def sweep(
     """
     settings = _settings(locals()) | {"method": "dipn+gn", "label": ""}
     from dipn_jax.physics import make_engine
+    from dipn_jax.planning.methods import Networks, PolicyConfig
     from dipn_jax.storage import resume
 
     from .. import metrics
-    from . import methods, sweeping
+    from . import on_tables, sweeping
 
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
     if candidates < len(every):
         raise UserError(f"--candidates {candidates}: want at least one for each of the {len(every)} distances")
-    chosen = methods.Plan(candidates=candidates, distances=every, gamma=gamma, threshold=threshold)
+    chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold)
     _check(out, seed, chosen)
-    plans = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
-    plans[sweeping.CHOSEN] = chosen
-    nets, physics = methods.Nets(push_net, grasp_net), make_engine(engine)
-    runs = nets.require(chosen.method)
+    configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
+    configs[sweeping.CHOSEN] = chosen
+    networks, physics = Networks(push_net, grasp_net), make_engine(engine)
+    runs = networks.runs("dipn+gn")
     kept = resume.Partial(out, settings, inputs=_inputs(runs, tables))
     ended: dict[str, dict[str, Any]] = kept.load({})
-    deciders = methods.load_each(list(plans.values()), nets, physics, slots=tables.slots())
-    for name, decide in zip(plans, deciders, strict=True):
+    policies = on_tables.load("dipn+gn", networks, physics, list(configs.values()))
+    for name, decide in zip(configs, policies, strict=True):
         if name not in ended:
             mine = settings | {"label": name}
             ended[name] = _clear(out / name, decide, physics, tables, settings=mine, runs=runs, longest=max(every))
@@ -180,14 +182,13 @@ def sweep(
 def _prediction_errors(
     push_net: pathlib.Path, physics: Engine, distances: tuple[float, ...], *, scenes: int, seed: int
 ) -> dict[str, float]:
-    """Errors of the predicted masks at each of `distances`, on `scenes` as published, one push each."""
-    from dipn_jax.planning import policy
-    from dipn_jax.storage import checkpoint
+    """Errors of the predicted masks at each of `distances`, one push on each of `scenes` as published."""
+    from dipn_jax.planning.predictors import load_predictor
     from dipn_jax.world.scenes import PAPER
 
     from . import sweeping
 
-    predictor = policy.load_predictor(checkpoint.find(push_net, network="dipn"), PAPER.slots)
+    predictor = load_predictor(push_net)
     return sweeping.prediction_errors(
         predictor, physics, PAPER, distances, scenes=scenes, seed=seed, longest=max(distances)
     )
@@ -201,13 +202,14 @@ def _inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]
 
 def _clear(
     out: pathlib.Path,
-    decide: methods.Decider,
+    decide: TablePolicy,
     physics: Engine,
     tables: Tables,
     *,
     settings: dict[str, Any],
     runs: dict[str, pathlib.Path],
     longest: float,
+    remember: bool = True,
 ) -> dict[str, Any]:
     """Clear tables and write the results; continues where it was interrupted.
 
@@ -219,6 +221,7 @@ def _clear(
       settings: options, for `settings.json`.
       runs: networks that `decide` uses.
       longest: metres of the longest push.
+      remember: whether grasps like one that missed are doubted.
 
     Returns:
       The metrics.
@@ -229,7 +232,8 @@ def _clear(
 
     seed = settings["seed"]
     partial = resume.Partial(out, settings, inputs=_inputs(runs, tables))
-    ended = lockstep.clear(tables.make(physics, seed=seed), physics, decide, partial, seed=seed, longest=longest)
+    instances = tables.make(physics, seed=seed)
+    ended = lockstep.clear(instances, physics, decide, partial, seed=seed, longest=longest, remember=remember)
     lockstep.save(ended, out)
     values = lockstep.summary(ended)
     options.finish(out, values, settings, partial)

@@ -51,7 +51,7 @@ def grasp(
     if not grasp_net and not curve:
         raise UserError("grasp: nothing to measure; give --grasp-net or --curve")
     from dipn_jax.physics import make_engine
-    from dipn_jax.planning import policy
+    from dipn_jax.planning import scorers
     from dipn_jax.storage import checkpoint, resume
     from dipn_jax.world import scenes
 
@@ -64,7 +64,7 @@ def grasp(
     partial = resume.Partial(out, settings, inputs=[run] if run else [])
     values: dict[str, Any] = curves.grasp_summary(curves.load_grasp_runs(curve))
     if run:
-        physics, scorer = make_engine(engine), policy.load_scorer(run)
+        physics, scorer = make_engine(engine), scorers.load_scorer(run)
         found, tables = success.evaluate(scorer, physics, config, partial, scenes=scenes_, seed=seed, others=others)
         alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
         values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}

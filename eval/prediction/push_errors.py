@@ -16,7 +16,7 @@ from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
 from dipn_jax.networks.dipn import DIPN
-from dipn_jax.planning import policy
+from dipn_jax.planning.predictors import dipn_motions, static_predictor, trans_predictor
 from dipn_jax.sight import imagine, masks, segment
 from dipn_jax.storage import resume
 from dipn_jax.structs import Observation, Push
@@ -64,7 +64,7 @@ def evaluate(
     Returns:
       Flat metrics, and pictures `[F, ...]` of some pushes (before, predicted, after 10 cm).
     """
-    predictors = _with_baselines(networks, config.slots)
+    predictors = _with_baselines(networks)
     rows: Rows = {}
     films: list[dict[str, np.ndarray]] = []
     done, batch, rows, films = partial.load((0, 0, rows, films))
@@ -90,29 +90,27 @@ def evaluate(
     return _summary(rows, names, segmented), {k: np.stack([film[k] for film in films]) for k in films[0]}
 
 
-def _with_baselines(networks: Mapping[str, DIPN], slots: int) -> dict[str, Predict]:
+def _with_baselines(networks: Mapping[str, DIPN]) -> dict[str, Predict]:
     """The networks as predictors, then `static` (nothing moves) and `trans` (the pushed object moves along)."""
-    predictors = {name: network_predictor(network, slots) for name, network in networks.items()}
+    predictors = {name: network_predictor(network) for name, network in networks.items()}
     return predictors | {
-        "static": at_distances(policy.static_predictor(slots)),
-        "trans": at_distances(policy.trans_predictor(slots)),
+        "static": at_distances(static_predictor),
+        "trans": at_distances(trans_predictor),
     }
 
 
-def network_predictor(network: DIPN, slots: int) -> Predict:
+def network_predictor(network: DIPN) -> Predict:
     """A network as it is measured here; networks of one architecture share a compiled function."""
     graph, state = nnx.split(network)
     distances = lambda count: np.broadcast_to(_METRES, (count, len(_METRES)))  # noqa: E731
-    return lambda seen, pushes: batching.in_chunks(
-        lambda *rows: _network_motions(graph, state, slots, *rows), seen, pushes, distances(len(pushes.angle))
+    return lambda seen, pushes: batching.in_batches(
+        lambda *rows: _network_motions(graph, state, *rows), seen, pushes, distances(len(pushes.angle))
     )
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2))
-def _network_motions(
-    graph: Any, state: Any, slots: int, seen: Observation, pushes: Push, distances: jax.Array
-) -> jax.Array:
-    return policy.dipn_motions(nnx.merge(graph, state), seen, pushes, distances, slots=slots)
+@functools.partial(jax.jit, static_argnums=0)
+def _network_motions(graph: Any, state: Any, seen: Observation, pushes: Push, distances: jax.Array) -> jax.Array:
+    return dipn_motions(nnx.merge(graph, state), seen, pushes, distances)
 
 
 def at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict:
@@ -126,7 +124,7 @@ def at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict
 
         return jax.lax.map(one, (seen, pushes))
 
-    return lambda seen, pushes: batching.in_chunks(predict, seen, pushes)
+    return lambda seen, pushes: batching.in_batches(predict, seen, pushes)
 
 
 def _found(seen: Observation, slots: int) -> np.ndarray:
@@ -149,7 +147,7 @@ def measure(
       suffix: of the predictors' names.
     """
     truth, after = executed.truth, executed.labels_after
-    centers, motion = batching.in_chunks(_true_motion, seen.label, truth)
+    centers, motion = batching.in_batches(_true_motion, seen.label, truth)
     if not suffix:
         visible = np.asarray((seen.label[..., None] == np.arange(truth.shape[2])).any((1, 2)))
         rows.setdefault("visible", []).append(np.repeat(visible[:, None], len(DISTANCES), 1))
@@ -157,9 +155,9 @@ def measure(
     motions = {name: predictor(seen, executed.pushes) for name, predictor in predictors.items()}
     if executed.rolled is not None:
         before_rolled = np.concatenate([truth[:, :1], executed.rolled], 1)
-        motions["physics"] = batching.in_chunks(_true_motion, seen.label, before_rolled)[1]
+        motions["physics"] = batching.in_batches(_true_motion, seen.label, before_rolled)[1]
     for name, predicted in motions.items():
-        errors = batching.in_chunks(_errors, seen, centers, predicted, motion, after)
+        errors = batching.in_batches(_errors, seen, centers, predicted, motion, after)
         for key, value in errors.items():
             rows.setdefault(f"{name}{suffix}/{key}", []).append(np.asarray(value))
     return np.asarray(next(iter(motions.values())))

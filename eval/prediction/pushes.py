@@ -61,7 +61,7 @@ class Executed:
 def execute(key: jax.Array, engine: Engine, config: SceneConfig, count: int, *, physics: bool) -> Executed:
     """A push on each of `count` settled scenes, of those on which one is feasible and goes well."""
     drop, aim = jax.random.split(key)
-    items = clutter.settled_exactly(drop, engine, config, count)
+    items = clutter.settled_scenes(drop, engine, config, count)
     aimed, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)
     items, pushes = structs.take(items, np.asarray(feasible)), structs.take(aimed, np.asarray(feasible))
     if not np.asarray(feasible).any():
@@ -77,7 +77,7 @@ def execute(key: jax.Array, engine: Engine, config: SceneConfig, count: int, *, 
 
 
 def _one_push(keys: jax.Array, scene: Scene, poses: Any) -> tuple[Push, jax.Array]:
-    return batching.in_chunks(_push_each, keys, scene, poses)
+    return batching.in_batches(_push_each, keys, scene, poses)
 
 
 @jax.jit
@@ -85,8 +85,7 @@ def _push_each(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Push, j
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Push, jax.Array]:
         key, one_scene, one_poses = args
         seen = render.render(one_scene, one_poses)
-        slots = one_scene.shape.shape[0]
-        pushes, feasible = candidates.sample_pushes(key, seen, count=1, slots=slots, distance=PUSH_STEPS * 0.01)
+        pushes, feasible = candidates.sample_pushes(key, seen, count=1, distance=PUSH_STEPS * 0.01)
         return jax.tree.map(lambda leaf: leaf[0], pushes), feasible[0]
 
     return jax.lax.map(one, (keys, jax.tree.map(jnp.asarray, scene), jnp.asarray(poses)))
