@@ -13,7 +13,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.storage import checkpoint
 
-DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"
+DOCS = pathlib.Path(__file__).parents[2] / "docs"
 
 
 def _push_run(folder: pathlib.Path, extra: dict[str, int]) -> pathlib.Path:
