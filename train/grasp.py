@@ -125,7 +125,7 @@ def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
 
 def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
     """Windows `[B]`, `pixels` a side, of episodes `[B]`; numpy."""
-    return jax.device_get(batching.in_chunks(functools.partial(_windows, pixels=pixels), episodes))
+    return jax.device_get(batching.in_batches(functools.partial(_windows, pixels=pixels), episodes))
 
 
 def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array:

@@ -114,7 +114,7 @@ def rgbd(observation: Observation) -> jax.Array:
 
 def observe(scene: Scene, poses: Array) -> Observation:
     """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
-    return batching.in_chunks(_observe, scene, poses)
+    return batching.in_batches(_observe, scene, poses)
 
 
 @jax.jit

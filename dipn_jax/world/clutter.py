@@ -32,7 +32,7 @@ def settled(
       The scenes kept `[K]`, and how many were dropped and why others were not kept.
     """
     draw = functools.partial(_random_scenes, config=config)
-    scene, poses = jax.tree.map(np.asarray, batching.in_chunks(draw, jax.random.split(key, count)))
+    scene, poses = jax.tree.map(np.asarray, batching.in_batches(draw, jax.random.split(key, count)))
     rollout = primitives.settle(engine, scene, poses, fence=primitives.FENCE_TIME)
     fault = np.asarray(rollout.fault)
     everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)

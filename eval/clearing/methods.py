@@ -222,7 +222,7 @@ def _in_lockstep(
     decide: Decide, rule: Rule, distances: np.ndarray, keys: jax.Array, scene: Scene, poses: Array, missed: Array
 ) -> Choice:
     """`decide` on all tables `[B]`."""
-    choose: Choice = batching.in_few(
+    choose: Choice = batching.in_small_batches(
         functools.partial(_choices, decide=decide, rule=rule, distances=distances), keys, scene, poses, missed
     )
     return choose

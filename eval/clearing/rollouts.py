@@ -45,11 +45,11 @@ def decide(
       missed: `[B, M, 3]` grasps that missed.
     """
     propose = functools.partial(_proposals, scorer=scorer, rule=rule, distances=distances)
-    proposals = batching.in_few(propose, keys, scene, poses, missed)
+    proposals = batching.in_small_batches(propose, keys, scene, poses, missed)
     motion, believed = _motions(engine, scene, poses, proposals, max(float(max(distances)), PUSH_STEPS * 0.01))
     proposals = proposals.replace(feasible=proposals.feasible & believed)
     choose = functools.partial(_chosen, appraise=appraise, rule=rule)
-    chosen: Choice = batching.in_few(choose, scene, poses, proposals, motion)
+    chosen: Choice = batching.in_small_batches(choose, scene, poses, proposals, motion)
     return chosen
 
 
@@ -85,7 +85,7 @@ def _motions(
     table, which = np.nonzero(asked)
     motion, believed = np.zeros((*asked.shape, scene.shape.shape[1], 3), np.float32), np.ones(asked.shape, bool)
     guess = scenes.nominal(scene)
-    centers = np.asarray(batching.in_chunks(_centers, guess, poses))
+    centers = np.asarray(batching.in_batches(_centers, guess, poses))
     for begin in range(0, len(table), engine.batch):
         rows, push = table[begin : begin + engine.batch], which[begin : begin + engine.batch]
         pushes = jax.tree.map(lambda leaf, r=rows, p=push: leaf[r, p], proposals.pushes)

@@ -80,7 +80,7 @@ def prediction_errors(
     key, aim = jax.random.split(jax.random.key(seed))
     items = clutter.settled_exactly(key, engine, config, scenes)
     keys = jax.random.split(aim, scenes)
-    seen, pushes, feasible = batching.in_chunks(_look, keys, items.scene, items.poses)
+    seen, pushes, feasible = batching.in_batches(_look, keys, items.scene, items.poses)
     rows = np.flatnonzero(feasible)
     seen, pushes = structs.take(seen, rows), structs.take(pushes, rows)
     scene, poses = structs.take(items.scene, rows), items.poses[rows]
@@ -91,7 +91,7 @@ def prediction_errors(
             rollout = primitives.push(engine, scene, poses, each, longest=longest)
             after = np.asarray(rollout.poses)[:, -1]
             measure = functools.partial(_errors, predictor=predictor)
-            error, visible, moved = batching.in_chunks(measure, seen, each, scene, poses, after)
+            error, visible, moved = batching.in_batches(measure, seen, each, scene, poses, after)
             good = Fault.usable(rollout.fault)[:, None]
             for which, mask in (("all", visible), ("moved", moved)):
                 counted = np.asarray(mask) & good

@@ -79,7 +79,7 @@ def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], s
     scene = structs.stack([table.scene for table in tables])
     poses = np.stack([table.poses for table in tables])
     keys = jax.random.split(jax.random.key(seed), len(tables))
-    grasps, scores = batching.in_chunks(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
+    grasps, scores = batching.in_batches(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
     rollout, outcome = primitives.grasp(engine, scene, poses, jax.device_get(grasps))
     good = Fault.usable(rollout.fault)
     success = np.asarray(outcome.success, float)[good]
@@ -111,7 +111,7 @@ def _other_grasps(scorer: Scorer, engine: Engine, tables: list[Instance], count:
     if not states:
         return result
     scene, poses = structs.stack([state[0] for state in states]), np.stack([state[1] for state in states])
-    grasps = batching.in_chunks(functools.partial(_next_best, scorer=scorer, count=count), scene, poses)
+    grasps = batching.in_batches(functools.partial(_next_best, scorer=scorer, count=count), scene, poses)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     index = np.repeat(np.arange(len(states)), count)
     held, begin = [], 0
@@ -154,7 +154,7 @@ def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: i
     """
     items = clutter.settled_exactly(jax.random.key(seed), engine, config, scenes)
     keys = jax.random.split(jax.random.key(seed), scenes)
-    grasps, labels = batching.in_chunks(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
+    grasps, labels = batching.in_batches(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     index = np.repeat(np.arange(scenes), each)
     rollout, outcome = primitives.grasp(engine, structs.take(items.scene, index), items.poses[index], flat)

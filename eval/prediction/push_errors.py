@@ -102,7 +102,7 @@ def network_predictor(network: DIPN, slots: int) -> Predict:
     """A network as it is measured here; networks of one architecture share a compiled function."""
     graph, state = nnx.split(network)
     distances = lambda count: np.broadcast_to(_METRES, (count, len(_METRES)))  # noqa: E731
-    return lambda seen, pushes: batching.in_chunks(
+    return lambda seen, pushes: batching.in_batches(
         lambda *rows: _network_motions(graph, state, slots, *rows), seen, pushes, distances(len(pushes.angle))
     )
 
@@ -125,7 +125,7 @@ def _at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predic
 
         return jax.lax.map(one, (seen, pushes))
 
-    return lambda seen, pushes: batching.in_chunks(predict, seen, pushes)
+    return lambda seen, pushes: batching.in_batches(predict, seen, pushes)
 
 
 def _execute(
@@ -146,7 +146,7 @@ def _execute(
 
 
 def _one_push(keys: jax.Array, scene: Scene, poses: Any) -> tuple[Push, jax.Array]:
-    return batching.in_chunks(_push_each, keys, scene, poses)
+    return batching.in_batches(_push_each, keys, scene, poses)
 
 
 @jax.jit
@@ -198,7 +198,7 @@ def measure(
       rolled: `[B, K, N, 7]` poses after nominal pushes, measured as `physics`.
     """
     slots = truth.shape[2]
-    centers, motion = batching.in_chunks(_true_motion, seen.label, truth)
+    centers, motion = batching.in_batches(_true_motion, seen.label, truth)
     if not suffix:
         visible = np.asarray((true.label[..., None] == np.arange(slots)).any((1, 2)))
         rows.setdefault("visible", []).append(np.repeat(visible[:, None], len(DISTANCES), 1))
@@ -206,9 +206,9 @@ def measure(
     motions = {name: predictor(seen, pushes) for name, predictor in predictors.items()}
     if rolled is not None:
         before_rolled = np.concatenate([truth[:, :1], rolled], 1)
-        motions["physics"] = batching.in_chunks(_true_motion, seen.label, before_rolled)[1]
+        motions["physics"] = batching.in_batches(_true_motion, seen.label, before_rolled)[1]
     for name, predicted in motions.items():
-        errors = batching.in_chunks(_errors, seen, centers, predicted, motion, after)
+        errors = batching.in_batches(_errors, seen, centers, predicted, motion, after)
         for key, value in errors.items():
             rows.setdefault(f"{name}{suffix}/{key}", []).append(np.asarray(value))
     return np.asarray(next(iter(motions.values())))
