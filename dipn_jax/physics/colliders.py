@@ -200,26 +200,26 @@ def _narrow(m: Any, d: Any, key: Any, geom: jax.Array) -> Contacts:
     return dist, pos, frame
 
 
-def is_traced(m: Any, key: Any) -> bool:
+def is_traced(m: Any, kind: Any) -> bool:
     """Return whether the meshes of a model are hulls of `parts`, one a geom: its arrays then have a geom axis first."""
-    return m._impl.mesh_convex[key.data_ids[1]].vert.ndim == 3
+    return m._impl.mesh_convex[kind.data_ids[1]].vert.ndim == 3
 
 
-def collide(m: Any, d: Any, key: Any, geom: jax.Array) -> Contacts:
+def collide(m: Any, d: Any, kind: Any, geom: jax.Array) -> Contacts:
     """Find the contacts of pairs of geoms of one kind; arguments and result as of a collider of MJX.
 
     Args:
       m: MJX model whose meshes are traced (`is_traced`).
       d: its data, with the geoms' places.
-      key: kind of the pairs: a plane, a box or a mesh, and a mesh.
+      kind: what the pairs are, a `FunctionKey` of MJX: a plane, a box or a mesh, and a mesh.
       geom: `[G, 2]` geoms of each pair.
 
     Returns:
       As `plane_prism`, for all pairs: `[4 G]`, `[4 G, 3]` and `[4 G, 3, 3]`.
     """
-    if key.types[0] == GeomType.PLANE:
-        found = jax.vmap(plane_prism)(*_gather(m, d, key, geom)[0])
+    if kind.types[0] == GeomType.PLANE:
+        found = jax.vmap(plane_prism)(*_gather(m, d, kind, geom)[0])
     else:
-        found = _narrow(m, d, key, geom)
+        found = _narrow(m, d, kind, geom)
     distance, position, frame = jax.tree.map(jnp.concatenate, found)
     return distance, position, frame
