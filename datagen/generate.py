@@ -46,8 +46,8 @@ class Job:
     engine: EngineName = "auto"
     timestep: float | None = None  # seconds; the engine's own if None
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,)  # metres: each push is made once for every one of them
-    guided: float = 0.0  # share of grasps that a network believes in
-    hard: float = 0.0  # share of grasps that it is unsure of
+    guided: float = 0.0  # share of grasps that a network scores high
+    hard: float = 0.0  # share of grasps that the network is unsure of
     weights: str = ""  # SHA-256 of that network
 
     def __post_init__(self) -> None:

@@ -49,7 +49,7 @@ UNCOVERED_REWARD = 0.8
 
 @flax.struct.dataclass
 class Look(Pytree):
-    """What a learner sees of a table, and the actions that it may choose."""
+    """A table as a learner sees it, and the actions that it may choose."""
 
     height: Array  # [H, W] metres
     push: Push  # the best one

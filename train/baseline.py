@@ -44,7 +44,7 @@ RECENT_ACTIONS = 100
 
 @dataclasses.dataclass(frozen=True)
 class BaselineConfig:
-    """How to learn."""
+    """Settings of a run of a compared method."""
 
     method: MethodName = "vpg"
     preset: str = "compact"

@@ -26,7 +26,7 @@ import grain  # noqa: E402
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """How to train."""
+    """Settings of a training run."""
 
     steps: int = 2000
     batch: int = 32

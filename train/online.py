@@ -36,7 +36,7 @@ RECENT_GRASPS = 50
 
 @dataclasses.dataclass(frozen=True)
 class OnlineConfig:
-    """How to learn."""
+    """Settings of a run that learns online."""
 
     grasps: int = 300
     tables: int = 10

@@ -33,7 +33,7 @@ class DipnConfig:
 
     @property
     def view(self) -> View:
-        """How the network sees a push."""
+        """View of a push that the network is shown."""
         return push_frame.PAPER if self.preset == "paper" else push_frame.COMPACT
 
 

@@ -36,7 +36,7 @@ _FAR_AWAY = 10.0
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """How a network is shown a push."""
+    """Form in which a network is shown a push."""
 
     crop: int  # pixels of a crop's side
     stride: int  # pixels between its samples

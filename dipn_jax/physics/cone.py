@@ -38,7 +38,7 @@ FIRST_STEPS = np.float32(4.0) ** np.arange(-6, 2, dtype=np.float32)
 STRETCH_LIMIT = 4.0 ** len(FIRST_STEPS)
 """Factor by which a step grows at most from one round of tries to the next while the minimum is further on."""
 _TINY = 1e-12
-"""What lengths and squares are raised to before something is divided by them."""
+"""Least divisor: lengths and squares are raised to it before something is divided by them."""
 
 
 @flax.struct.dataclass
@@ -60,7 +60,7 @@ class _Problem(Pytree):
 
 @flax.struct.dataclass
 class _Reach(Pytree):
-    """Where residuals `u [C, K]` lie with respect to their cones."""
+    """Places of residuals `u [C, K]` with respect to their cones."""
 
     away: jax.Array  # [C, K] from the nearest point of the cone to u
     below: jax.Array  # [C] bool: the nearest point is the tip

@@ -25,7 +25,7 @@ _DEAD_RADIUS = -1e3
 
 @flax.struct.dataclass
 class Parts(Pytree):
-    """The convex parts of one object as MJX wants them: each about its own centre."""
+    """The convex parts of one object in the form that MJX takes: each about its own centre."""
 
     center: jax.Array  # [P, 3] metres, object's frame: a point inside
     radius: jax.Array  # [P] metres: ball about the centre; negative where there is no part
