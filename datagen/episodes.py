@@ -76,9 +76,8 @@ def aim_pushes(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int
 @functools.partial(jax.jit, static_argnames="actions")
 def _aim_pushes(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int) -> tuple[Push, jax.Array]:
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Push, jax.Array]:
-        slots = args[1].shape.shape[0]
         seen = render.render(*args[1:])
-        return candidates.sample_pushes(args[0], seen, count=actions, slots=slots, distance=PUSH_STEPS * 0.01)
+        return candidates.sample_pushes(args[0], seen, count=actions, distance=PUSH_STEPS * 0.01)
 
     return jax.lax.map(one, (keys, scene, poses))
 

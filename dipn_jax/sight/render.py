@@ -96,9 +96,14 @@ def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixe
 
 @functools.partial(jax.jit, static_argnames=("pixels",))
 def render(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> Observation:
-    """What the camera sees of one scene; arguments as `render_depth`."""
+    """Render what the camera sees of one scene; arguments as `render_depth`.
+
+    names, scenes, poses = dipn_jax.load_cases()
+    observation = dipn_jax.render(scenes[0], poses[0])
+    every = jax.vmap(dipn_jax.render)(scenes, poses)
+    """
     height, label = render_depth(scene, poses, pixels=pixels)
-    return Observation(height, paint_labels(label, scene.color), label)
+    return Observation(height, paint_labels(label, scene.color), label, scene.shape.shape[0])
 
 
 def paint_labels(label: jax.Array, color: jax.Array) -> jax.Array:
@@ -120,4 +125,4 @@ def observe(scene: Scene, poses: Array) -> Observation:
 @jax.jit
 def _observe(scene: Scene, poses: jax.Array) -> Observation:
     height, label = jax.lax.map(lambda pair: render_depth(*pair), (scene, poses))
-    return Observation(height, jax.vmap(paint_labels)(label, scene.color), label)
+    return Observation(height, jax.vmap(paint_labels)(label, scene.color), label, scene.shape.shape[1])

@@ -78,7 +78,7 @@ def prediction_errors(
       `sweep/DISTANCE/push_error/{all,moved}` with bootstrap 95 % intervals over scenes.
     """
     key, aim = jax.random.split(jax.random.key(seed))
-    items = clutter.settled_exactly(key, engine, config, scenes)
+    items = clutter.settled_scenes(key, engine, config, scenes)
     keys = jax.random.split(aim, scenes)
     seen, pushes, feasible = batching.in_batches(_look, keys, items.scene, items.poses)
     rows = np.flatnonzero(feasible)
@@ -106,7 +106,7 @@ def prediction_errors(
 def _look(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Observation, Push, jax.Array]:
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Observation, Push, jax.Array]:
         seen = render.render(*args[1:])
-        pushes, feasible = candidates.sample_pushes(args[0], seen, count=1, slots=args[2].shape[0], distance=0.1)
+        pushes, feasible = candidates.sample_pushes(args[0], seen, count=1, distance=0.1)
         return seen, jax.tree.map(lambda leaf: leaf[0], pushes), feasible[0]
 
     return jax.lax.map(one, (keys, scene, poses))

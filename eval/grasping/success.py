@@ -14,7 +14,7 @@ import numpy as np
 
 from dipn_jax import batching, console, structs
 from dipn_jax.engine import Engine
-from dipn_jax.planning import candidates
+from dipn_jax.planning import candidates, methods
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import render
 from dipn_jax.sight.fingers import label_image
@@ -24,7 +24,7 @@ from dipn_jax.world import clutter, primitives
 from dipn_jax.world.scenes import SceneConfig
 
 from .. import metrics
-from ..clearing import instances, lockstep, methods
+from ..clearing import instances, lockstep, on_tables
 from ..clearing.instances import Instance
 
 BINS = 10
@@ -56,7 +56,7 @@ def evaluate(
     """
     tables = instances.random_instances(engine, config, count=scenes, seed=seed)
     result = _random_foreground(scorer, engine, tables, seed)
-    tables = lockstep.clear(tables, engine, methods.best_grasp(scorer, slots=config.slots), partial, seed=seed)
+    tables = lockstep.clear(tables, engine, on_tables.in_lockstep(methods.grasping_policy(scorer)), partial, seed=seed)
     held = [np.array([did == "grasp held" for did in table.did], float) for table in tables]
     scores = np.concatenate([[step["values"][0] for step in table.film] for table in tables])
     result |= _rate("gn", [each.sum() for each in held], [len(each) for each in held])
@@ -152,7 +152,7 @@ def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: i
       seed: of scenes and grasps.
       each: grasps on every scene.
     """
-    items = clutter.settled_exactly(jax.random.key(seed), engine, config, scenes)
+    items = clutter.settled_scenes(jax.random.key(seed), engine, config, scenes)
     keys = jax.random.split(jax.random.key(seed), scenes)
     grasps, labels = batching.in_batches(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
