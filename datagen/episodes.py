@@ -111,13 +111,13 @@ def grasp_batch(
     repeated = structs.take(items, np.repeat(np.arange(n), actions))
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
     episodes = GraspEpisode(
-        repeated.scene,
-        repeated.poses,
-        np.asarray(rollout.poses)[:, -1],
-        grasps,
-        np.asarray(outcome.held),
-        np.asarray(outcome.success),
-        np.asarray(rollout.fault),
+        scene=repeated.scene,
+        poses=repeated.poses,
+        after=np.asarray(rollout.poses)[:, -1],
+        grasp=grasps,
+        held=np.asarray(outcome.held),
+        success=np.asarray(outcome.success),
+        fault=np.asarray(rollout.fault),
     )
     return _drop_unusable(episodes, counts)
 
@@ -140,7 +140,7 @@ def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
 
 
 def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int) -> Batch:
-    """Settle up to `count` scenes, and do nothing to them."""
+    """Settled scenes, nothing done to them."""
     items, counts = clutter.settled(key, engine, config, count)
     return Batch(items if len(items.fault) else None, counts)
 
@@ -151,24 +151,3 @@ def _drop_unusable(episodes: Any, counts: dict[str, int], *, together: int = 1) 
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})
     good = Fault.usable(fault).reshape(-1, together).all(-1).repeat(together)
     return Batch(structs.take(episodes, good) if good.any() else None, counts)
-
-
-def batch(
-    key: jax.Array,
-    engine: Engine,
-    config: scenes.SceneConfig,
-    *,
-    kind: str,
-    count: int,
-    actions: int,
-    distances: tuple[float, ...],
-    guide: Guide | None,
-) -> Batch:
-    """Make a batch of one kind of episodes: push, grasp or images; options of other kinds are ignored."""
-    if kind == "push":
-        return push_batch(key, engine, config, count=count, actions=actions, distances=distances)
-    if kind == "grasp":
-        return grasp_batch(key, engine, config, count=count, actions=actions, guide=guide)
-    if kind == "images":
-        return image_batch(key, engine, config, count=count)
-    raise ValueError(f"kind {kind}: want push, grasp or images")

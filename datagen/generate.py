@@ -7,9 +7,11 @@ from __future__ import annotations
 import collections
 import concurrent.futures
 import dataclasses
+import functools
 import json
 import pathlib
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -94,14 +96,25 @@ class _Tally:
             self.progress.advance(fresh, f"{self.counts['dropped_scenes']} scenes dropped; {said}")
 
 
+def _maker(job: Job, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
+    """The function that makes a batch of episodes of `job`: (key, engine, scenes, *, count)."""
+    guide = episodes.Guide(scorer, job.guided, job.hard) if scorer else None
+    makers: dict[str, Callable[..., episodes.Batch]] = {
+        "push": functools.partial(episodes.push_batch, actions=job.actions, distances=job.distances),
+        "grasp": functools.partial(episodes.grasp_batch, actions=job.actions, guide=guide),
+        "images": episodes.image_batch,
+    }
+    return makers[job.kind]
+
+
 def shard(
     job: Job, index: int, engine: Engine, tally: _Tally, scorer: Scorer | None = None
 ) -> tuple[Any, dict[str, int]]:
     """Return the episodes of one shard and the counts of the batches that they are from."""
     want = job.size(index)
     key = jax.random.fold_in(jax.random.key(job.seed), index)
+    make = _maker(job, scorer)
     each = job.actions * (len(job.distances) if job.kind == "push" else 1)
-    guide = episodes.Guide(scorer, job.guided, job.hard) if scorer else None
     done: list[Any] = []
     counts: collections.Counter[str] = collections.Counter()
     have = empty = 0
@@ -109,16 +122,7 @@ def shard(
         key, batch_key = jax.random.split(key)
         # a tenth more than needed, for scenes that are dropped
         count = min(engine.batch, int(1.1 * (want - have) / each) + 1)
-        batch = episodes.batch(
-            batch_key,
-            engine,
-            job.scene,
-            kind=job.kind,
-            count=count,
-            actions=job.actions,
-            distances=job.distances,
-            guide=guide,
-        )
+        batch = make(batch_key, engine, job.scene, count=count)
         counts.update(batch.counts)
         empty = empty + 1 if batch.episodes is None else 0
         if empty == MAX_ATTEMPTS:

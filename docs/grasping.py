@@ -10,7 +10,7 @@ import shutil
 import sys
 from typing import Any
 
-from dipn_jax.eval.grasping import curve
+from dipn_jax.eval import curves
 
 from dipn_jax import console, files
 
@@ -53,7 +53,7 @@ def label_table(values: dict[str, Any]) -> str:
 
 def tables(values: dict[str, Any]) -> list[str]:
     """All tables of the page."""
-    return [success_table(values), curve.table(values, COUNTS), label_table(values)]
+    return [success_table(values), curves.grasp_table(values, COUNTS), label_table(values)]
 
 
 def main() -> None:

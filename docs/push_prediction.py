@@ -11,7 +11,7 @@ import shutil
 import sys
 from typing import Any
 
-from dipn_jax.eval.prediction import curve
+from dipn_jax.eval import curves
 
 from dipn_jax import console, files
 from dipn_jax.world import shapes
@@ -25,7 +25,7 @@ SHIFTS = {
     "shift-stickier": "friction 0.5 to 0.7",
     "shift-crowded": "8 to 15 objects (1 to 7)",
 }
-COLUMNS = [(f"{c}cm", which) for c in curve.DISTANCES for which in ("all", "moved")]
+COLUMNS = [(f"{c}cm", which) for c in curves.DISTANCES for which in ("all", "moved")]
 
 
 def shift_table(values: dict[str, Any]) -> str:
@@ -123,10 +123,10 @@ def goal_table(values: dict[str, Any]) -> str:
 
 def tables(values: dict[str, Any]) -> list[str]:
     """All tables of the page."""
-    curves = [curve.table(values, which=which) for which in ("all", "moved")]
+    pages = [curves.push_table(values, which=which) for which in ("all", "moved")]
     return [
         goal_table(values),
-        *curves,
+        *pages,
         alone_table(values),
         shift_table(values),
         unseen_table(values),

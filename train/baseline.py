@@ -10,7 +10,7 @@ import functools
 import json
 import pathlib
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from dipn_jax import files, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
-from dipn_jax.networks.vpg import VpgConfig
+from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Grasp, GraspEpisode
@@ -29,37 +29,22 @@ from dipn_jax.world.scenes import SceneConfig
 
 from . import acting, tables
 from .acting import Look
+from .configs import BaselineConfig
 from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, view, windows
 from .loop import constant_adamw, make_step
 from .rounds import Run
 
-MethodName = Literal["vpg", "rea", "dqn"]
 LEARNT_PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
-"""Parts of the network that each method learns: REA+DIPN uses REA's grasps only, DQN+GN takes GN's grasps."""
+"""What each method learns: REA+DIPN uses REA's grasps only, DQN+GN has GN for its grasps."""
 PUSH_DISTANCE = 0.10
-"""Length of a push in metres."""
+"""Metres of a push."""
 RECENT_ACTIONS = 100
-"""Last actions over which recent rewards are averaged."""
-
-
-@dataclasses.dataclass(frozen=True)
-class BaselineConfig:
-    """Settings of a run of a compared method."""
-
-    method: MethodName = "vpg"
-    preset: str = "compact"
-    actions: int = 2500
-    tables: int = 10
-    updates: int = 10  # optimizer steps after each round of one action a table
-    batch: int = 32
-    learning_rate: float = 5e-4
-    weight_decay: float = 1e-4
-    seed: int = 0
+"""The number of last actions over which rewards are averaged."""
 
 
 @dataclasses.dataclass
 class State:
-    """State of a run after some rounds."""
+    """Everything that an interrupted run needs to continue."""
 
     params: Any
     rest: Any  # of the network: batch statistics
@@ -73,7 +58,7 @@ class State:
 
 
 class _Outcomes:
-    """The task for `make_step`; a batch holds windows for each part of the network."""
+    """The part of a task that `make_step` needs: one batch of windows for each part of the network."""
 
     def __init__(self, answers: str) -> None:
         self.answers = answers
@@ -103,15 +88,15 @@ def learn(
     scorer: Scorer | None = None,
     scored_by: str = "",
 ) -> dict[str, float]:
-    """Learn in the folder `out`; an interrupted run continues.
+    """Learn in the folder `out`; a run that was interrupted continues.
 
     Args:
       engine: physics.
       scenes: distribution of fresh tables.
       config: how to learn.
       out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
-      scorer: GN, for method `dqn`, which takes its grasps.
-      scored_by: digest of the weights of that GN.
+      scorer: GN, whose grasps `dqn` executes.
+      scored_by: digest of its weights.
 
     Returns:
       Mean reward of all and of the last pushes and grasps.
@@ -119,15 +104,33 @@ def learn(
     Raises:
       UserError: the folder holds another run, or there is no scorer for `dqn`.
     """
-    network = _network_config(config, scored=scorer is not None)
+    if (config.method == "dqn") != (scorer is not None):
+        raise UserError(
+            f"baseline: --method {config.method} takes {'a' if config.method == 'dqn' else 'no'} --grasp-net"
+        )
+    network = VpgConfig(config.preset, LEARNT_PARTS[config.method], "chance" if config.method == "rea" else "value")
     model: Any = checkpoint.build("vpg", network, seed=config.seed)
     run = Run(out, _identity(engine, scenes, config, scored_by))
     ended = run.ended()
     if ended:
         return {name: value for name, value in ended.items() if name.startswith("reward/")}
+    state = _play(run, model, engine, scenes, config, scorer)
+    nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
+    result = _rewards(state.did, len(state.did)) | {
+        f"{k}/recent": v for k, v in _rewards(state.did, RECENT_ACTIONS).items()
+    }
+    extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
+    run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
+    return result
+
+
+def _play(
+    run: Run, model: VPG, engine: Engine, scenes: SceneConfig, config: BaselineConfig, scorer: Scorer | None
+) -> State:
+    """Act and learn to the end of the run."""
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    optimizer = constant_adamw(config.learning_rate, config.weight_decay)
-    step = make_step(_Outcomes(network.answers), graph, optimizer)
+    optimizer = constant_adamw(config)
+    step = make_step(_Outcomes(model.config.answers), graph, optimizer)
     weights, statistics = jax.device_get((params, rest))
 
     def fresh() -> State:
@@ -140,29 +143,8 @@ def learn(
         state.params, state.rest, state.moments = _update(state, step, config)
         return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT_ACTIONS).items())
 
-    total, log = -(-config.actions // config.tables), functools.partial(_log, out, config)
-    state = run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
-    nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
-    result = _rewards(state.did, len(state.did)) | {
-        f"{k}/recent": v for k, v in _rewards(state.did, RECENT_ACTIONS).items()
-    }
-    extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
-    run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
-    return result
-
-
-def _network_config(config: BaselineConfig, *, scored: bool) -> VpgConfig:
-    """Return the architecture that a method learns.
-
-    Raises:
-      UserError: there is no scorer for `dqn`, or one for another method.
-    """
-    if (config.method == "dqn") != scored:
-        raise UserError(
-            f"baseline: --method {config.method} takes {'a' if config.method == 'dqn' else 'no'} --grasp-net"
-        )
-    answers = "chance" if config.method == "rea" else "value"
-    return VpgConfig(config.preset, LEARNT_PARTS[config.method], answers)
+    total, log = -(-config.actions // config.tables), functools.partial(_log, run.out, config)
+    return run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
 
 
 def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, scored_by: str) -> dict[str, Any]:
@@ -172,7 +154,7 @@ def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, score
 
 
 def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneConfig, config: BaselineConfig) -> None:
-    """Act once on every table, and store in `state` the results and what there is to learn from them."""
+    """Act once on every table; keep what happened and what it teaches."""
     count, before = config.tables, state.tables
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.round), (2, count))
     anew = np.ones(count, bool) if state.then is None else state.anew
@@ -197,7 +179,13 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
         if name in LEARNT_PARTS[config.method] and rows.any():
             aim = Grasp(centre, angle, np.zeros(count, np.float32))
             tried = GraspEpisode(
-                before.scene, before.poses, poses, aim, held, target.astype(np.float32), np.zeros(count, int)
+                scene=before.scene,
+                poses=before.poses,
+                after=poses,
+                grasp=aim,
+                held=held,
+                success=target.astype(np.float32),
+                fault=np.zeros(count, int),
             )
             taught = windows(structs.take(tried, rows), pixels=WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS)
             state.seen[name].append(taught)
@@ -232,7 +220,7 @@ def _rewards(did: list[tuple[str, float]], last: int) -> dict[str, float]:
 
 
 def _log(out: pathlib.Path, config: BaselineConfig, state: State) -> None:
-    """Write `metrics.jsonl`: the mean rewards of the last actions, after each round."""
+    """Write `metrics.jsonl`: the number of actions after each round, and mean rewards of the last of them."""
     counts = range(config.tables, len(state.did) + 1, config.tables)
     rows = [{"step": n, **_rewards(state.did[:n], RECENT_ACTIONS)} for n in counts]
     files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())

@@ -20,22 +20,10 @@ from dipn_jax import console, files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import checkpoint
 
+from .configs import BaselineConfig, OnlineConfig, TrainConfig
+
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
 import grain  # noqa: E402
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """Settings of a training run."""
-
-    steps: int = 2000
-    batch: int = 32
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-4
-    optimizer: str = "adamw"  # cosine decay; or sgd: momentum 0.9, constant rate, as published
-    seed: int = 0
-    eval_every: int = 200
-    save_every: int = 200
 
 
 class Taught(Protocol):
@@ -77,9 +65,10 @@ def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
     raise UserError(f"--optimizer {config.optimizer}: want adamw or sgd")
 
 
-def constant_adamw(learning_rate: float, weight_decay: float) -> optax.GradientTransformation:
-    """Return the optimizer of runs that learn while they act: AdamW at a constant rate."""
-    return optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(learning_rate, weight_decay=weight_decay))
+def constant_adamw(config: OnlineConfig | BaselineConfig) -> optax.GradientTransformation:
+    """The optimizer of a run that learns while it acts: AdamW with a constant rate."""
+    adamw = optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
+    return optax.chain(optax.clip_by_global_norm(1.0), adamw)
 
 
 def _split(model: nnx.Module) -> tuple[Any, Any, Any]:

@@ -16,7 +16,7 @@ from flax import nnx
 from dipn_jax import files, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
-from dipn_jax.networks.grasp import GraspConfig, score_image
+from dipn_jax.networks.grasp import GraspNet, score_image
 from dipn_jax.planning import candidates
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint
@@ -25,32 +25,19 @@ from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
 
 from . import tables
+from .configs import OnlineConfig
 from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
 from .loop import constant_adamw, make_step
 from .rounds import Run
 from .tables import Tables
 
 RECENT_GRASPS = 50
-"""Last grasps over which recent success is averaged."""
-
-
-@dataclasses.dataclass(frozen=True)
-class OnlineConfig:
-    """Settings of a run that learns online."""
-
-    grasps: int = 300
-    tables: int = 10
-    updates: int = 20  # optimizer steps after each round of one grasp a table
-    batch: int = 32
-    learning_rate: float = 5e-4
-    weight_decay: float = 1e-4
-    seed: int = 0
-    pretrained: bool = False  # whether the network has learnt from images; noted in the run
+"""The number of last grasps over which success is counted."""
 
 
 @dataclasses.dataclass
 class State:
-    """State of a run after some rounds."""
+    """Everything that an interrupted run needs to continue."""
 
     params: Any  # of the network
     moments: Any  # of the optimizer
@@ -61,18 +48,12 @@ class State:
 
 
 def learn(
-    model: nnx.Module,
-    network_config: GraspConfig,
-    engine: Engine,
-    scenes: SceneConfig,
-    config: OnlineConfig,
-    out: pathlib.Path,
+    model: GraspNet, engine: Engine, scenes: SceneConfig, config: OnlineConfig, out: pathlib.Path
 ) -> dict[str, float]:
-    """Learn online in the folder `out`; an interrupted run continues.
+    """Learn online in the folder `out`; a run that was interrupted continues.
 
     Args:
-      model: network to begin with.
-      network_config: its architecture.
+      model: network to begin with; a compact one.
       engine: physics.
       scenes: distribution of fresh tables.
       config: how to learn.
@@ -84,13 +65,31 @@ def learn(
     Raises:
       UserError: the network is not compact, or the folder holds another run.
     """
-    _require_compact(network_config)
-    run = Run(out, _identity(model, engine, scenes, config))
+    if model.config.preset != "compact":
+        raise UserError(
+            f"grasp-online: takes a compact network, got {model.config.preset}; that one learns from a data set, by "
+            "dipn-train grasp"
+        )
+    identity = {"initial_weights": checkpoint.digest(model), **dataclasses.asdict(config), "scenes": str(scenes)}
+    run = Run(out, identity | {"engine": type(engine).__name__})
     ended = run.ended()
     if ended:
         return {name: ended[name] for name in ("success", "success_recent")}
+    state = _play(run, model, engine, scenes, config)
+    nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
+    result = {
+        "success": float(np.mean(state.success)),
+        "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
+    }
+    extra = {"seed": config.seed, "examples": len(state.success), **result}
+    run.finish(model, len(state.success), network="grasp", config=model.config, extra=extra)
+    return result
+
+
+def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> State:
+    """Grasp and learn to the end of the run."""
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    optimizer = constant_adamw(config.learning_rate, config.weight_decay)
+    optimizer = constant_adamw(config)
     step = make_step(_Outcomes(), graph, optimizer)
     key = jax.random.key(config.seed)
     weights = jax.device_get(params)
@@ -104,42 +103,15 @@ def learn(
         state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
         return f"{np.mean(state.success[-RECENT_GRASPS:]):.2f} of the last {RECENT_GRASPS} held"
 
-    log = functools.partial(_log, out, config)
-    state = run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
-    nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
-    result = {
-        "success": float(np.mean(state.success)),
-        "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
-    }
-    extra = {"seed": config.seed, "examples": len(state.success), **result}
-    run.finish(model, len(state.success), network="grasp", config=network_config, extra=extra)
-    return result
-
-
-def _require_compact(network: GraspConfig) -> None:
-    """Raise UserError where a network is not compact."""
-    if network.preset != "compact":
-        raise UserError(
-            f"grasp-online: takes a compact network, got {network.preset}; that one learns from a data set, by "
-            "dipn-train grasp"
-        )
-
-
-def _identity(model: nnx.Module, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> dict[str, Any]:
-    """Return everything that determines the run."""
-    return {
-        "initial_weights": checkpoint.digest(model),
-        **dataclasses.asdict(config),
-        "scenes": str(scenes),
-        "engine": type(engine).__name__,
-    }
+    log = functools.partial(_log, run.out, config)
+    return run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
 
 
 class _Outcomes:
-    """The task for `make_step`."""
+    """The part of a task that `make_step` needs."""
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
-        """Return the loss of executed grasps."""
+        """Cross entropy of executed grasps."""
         return executed_loss(key, model, batch)
 
 
@@ -164,7 +136,9 @@ def _grasp(state: State, best_grasps: Callable[..., Grasp], engine: Engine, scen
     scene, poses, held, fault = clutter.grasp_away(engine, before.scene, before.poses, taken)
     good = Fault.usable(fault)
     success = np.asarray(held.any(1))
-    tried = GraspEpisode(before.scene, before.poses, poses, taken, held, success, fault)
+    tried = GraspEpisode(
+        scene=before.scene, poses=before.poses, after=poses, grasp=taken, held=held, success=success, fault=fault
+    )
     if good.any():
         state.seen.append(windows(structs.take(tried, good), pixels=WINDOW_PIXELS["compact"] + 2 * SHIFT_PIXELS))
     state.success += [bool(one) for one in np.asarray(success)[good]]
@@ -187,7 +161,7 @@ def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineCon
 
 
 def _log(out: pathlib.Path, config: OnlineConfig, state: State) -> None:
-    """Write `metrics.jsonl`: success over the last grasps, after each round."""
+    """Write `metrics.jsonl`: the number of grasps after each round, and success over the last of them."""
     counts = range(config.tables, len(state.success) + 1, config.tables)
     rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT_GRASPS) : n]))} for n in counts]
     files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())

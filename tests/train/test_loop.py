@@ -112,7 +112,7 @@ def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pat
     scene = scenes.fixed_count(3, spread=0.2)
 
     def learn(out: pathlib.Path) -> dict[str, float]:
-        return online.learn(checkpoint.build("grasp", network), network, engine, scene, plan, out)
+        return online.learn(checkpoint.build("grasp", network), engine, scene, plan, out)
 
     whole = learn(tmp_path / "a")
     with pytest.MonkeyPatch.context() as patch:
@@ -132,7 +132,7 @@ def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pat
     assert [line["step"] for line in lines] == [2, 4, 6]
     published = GraspConfig(preset="paper", stages=(1, 1, 1, 1))
     with pytest.raises(UserError, match="takes a compact network"):
-        online.learn(checkpoint.build("grasp", published), published, engine, scene, plan, tmp_path / "c")
+        online.learn(checkpoint.build("grasp", published), engine, scene, plan, tmp_path / "c")
 
 
 def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path]) -> None:

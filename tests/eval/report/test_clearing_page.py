@@ -4,7 +4,7 @@ import importlib.util
 import json
 import pathlib
 
-DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"
+DOCS = pathlib.Path(__file__).parents[3] / "docs"
 
 
 def test_the_page_in_docs_shows_the_figures_in_docs() -> None:
