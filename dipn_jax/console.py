@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any
 
@@ -156,20 +156,29 @@ class Interruption:
 
 
 def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | None = None) -> int:
-    """Parse and run one of `commands`.
+    """Parse and run one of `commands`; returns the exit code, as `exit_code` does."""
+    enable_compilation_cache()
+
+    def work() -> None:
+        tyro.extras.subcommand_cli_from_dict(
+            commands, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,)
+        )
+
+    return exit_code(work)
+
+
+def exit_code(work: Callable[[], int | None]) -> int:
+    """Do a command's work and turn what stops it into the exit code of the process.
 
     Returns:
-      The exit code: 0, or 2 after one line on standard error for a mistake of the user's; 130 when interrupted
-      (what was written before stays valid, and the same command goes on from there).
+      What `work` returns, or 0 if that is None; 2 after one line on standard error for a mistake of the user's; 130
+      when interrupted (what was written before stays valid, and the same command continues).
     """
-    enable_compilation_cache()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job manager's stop is an interruption
     try:
         try:
-            tyro.extras.subcommand_cli_from_dict(
-                commands, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,)
-            )
+            return work() or 0
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # who reads what we say, such as `head`, has seen enough
@@ -186,4 +195,3 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from here", file=sys.stderr)
         return 130
-    return 0
