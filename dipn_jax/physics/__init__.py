@@ -7,7 +7,6 @@ one runs is a configuration value.
 from __future__ import annotations
 
 import dataclasses
-import os
 from types import ModuleType
 
 import jax
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 
 from dipn_jax.engine import Engine, EngineName, PhysicsConfig
 from dipn_jax.errors import UserError
+from dipn_jax.machine import cores
 from dipn_jax.structs import Array
 
 CONTROL_PERIOD = 0.01
@@ -44,11 +44,6 @@ def fence_force(mass: Array, position: Array, velocity: Array, *, xp: ModuleType
     beyond = position - xp.clip(position, -FENCE, FENCE)
     pull = -(FENCE_RATE**2) * beyond - 2 * FENCE_RATE * velocity
     return mass[..., None] * xp.where(beyond == 0, 0.0, pull)
-
-
-def cores() -> int:
-    """Return the number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def substeps(config: PhysicsConfig) -> int:
