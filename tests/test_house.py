@@ -131,6 +131,14 @@ def test_every_module_has_a_docstring_and_is_of_readable_size() -> None:
             assert text.count("\n") <= 320, path
 
 
+def test_the_makefile_is_short_and_its_modules_exist() -> None:
+    lines = (ROOT / "Makefile").read_text().splitlines()
+    assert len(lines) <= 40 and max(map(len, lines)) <= 120
+    modules = {word for line in lines for word in line.split() if word.startswith("experiments.")}
+    for name in modules - {"experiments.NAME"}:
+        assert (ROOT / name.replace(".", "/")).with_suffix(".py").is_file(), name
+
+
 @pytest.mark.slow
 def test_the_wheel_holds_all_four_packages_and_the_data(tmp_path: pathlib.Path) -> None:
     """Built from the sources alone, installed into an empty folder, imported from there; dependencies are ours."""
