@@ -30,7 +30,7 @@ def _need_torch() -> None:
 
 def _image(seed: int) -> np.ndarray:
     """What the camera sees of a scene of ten objects `[224, 224, 4]`."""
-    items = clutter.settled_exactly(jax.random.key(seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
+    items = clutter.settled_scenes(jax.random.key(seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
     seen = jax.tree.map(lambda leaf: leaf[0], render.observe(items.scene, items.poses))
     return np.asarray(render.rgbd(seen))
 

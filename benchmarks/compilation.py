@@ -34,7 +34,7 @@ def first_calls() -> float:
     draw = jax.jit(jax.vmap(lambda key: scenes.random_scene(key, config=scenes.fixed_count(OBJECTS))))
     scene, poses = draw(jax.random.split(jax.random.key(0), batching.BATCH))
     seen = render.observe(scene, poses)
-    aim = jax.jit(jax.vmap(lambda key, one: candidates.sample_pushes(key, one, count=3, slots=OBJECTS, distance=0.1)))
+    aim = jax.jit(jax.vmap(lambda key, one: candidates.sample_pushes(key, one, count=3, distance=0.1)))
     jax.block_until_ready(aim(jax.random.split(jax.random.key(1), batching.BATCH), seen))
     few = jax.tree.map(lambda leaf: np.asarray(leaf)[:BATCH], scene)
     primitives.settle(engine, few, np.asarray(poses)[:BATCH], duration=0.01)

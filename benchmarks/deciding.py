@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from dipn_jax.eval.clearing import instances, lockstep, methods
+from dipn_jax.eval.clearing import instances, lockstep, on_tables
 from flax import nnx
 
 from benchmarks.harness import Setting, alternate, quiet, seconds
@@ -19,7 +19,7 @@ from dipn_jax import geometry, structs
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import VIEW, GraspConfig
 from dipn_jax.physics import make_engine
-from dipn_jax.planning import candidates, planner, policy
+from dipn_jax.planning import candidates, methods, planner, predictors, scorers
 from dipn_jax.sight import imagine, masks, render
 from dipn_jax.storage import checkpoint, resume
 from dipn_jax.structs import Decision, Observation, Push
@@ -28,7 +28,7 @@ from dipn_jax.world import cases, clutter, scenes
 
 BUILTIN = pathlib.Path("builtin")
 COUNTS = (16, 64, 256)
-ALWAYS = planner.Rule(threshold=1.0)
+ALWAYS = planner.Rule(grasp_above=1.0)
 """Pushes are considered however good the best grasp is: a decision at its full cost."""
 KINDS = (("3:8", 1.0), ("1:10", 0.0), ("20", 0.0), ("30", 0.0))
 """Objects and share of packed scenes of those on which both paths decide."""
@@ -45,40 +45,43 @@ def _networks(preset: str) -> tuple[Any, Any]:
     return dipn, gn
 
 
-def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> tuple[Observation, int]:
-    """Observations `[count]` of random scenes, and their slots."""
+def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> Observation:
+    """Observations `[count]` of random scenes."""
     config = scenes.parse_objects(objects, ranges=scenes.Ranges(packed=packed))
-    items = clutter.settled_exactly(jax.random.key(seed), make_engine("native"), config, count)
-    return jax.device_get(render.observe(items.scene, items.poses)), config.slots
+    items = clutter.settled_scenes(jax.random.key(seed), make_engine("native"), config, count)
+    observations: Observation = jax.device_get(render.observe(items.scene, items.poses))
+    return observations
 
 
-def _decider(preset: str, slots: int, count: int, *, fast: bool) -> Callable[[Observation, int], Decision]:
+def _decider(preset: str, count: int, *, fast: bool) -> Callable[[Observation, int], Decision]:
     dipn, gn = _networks(preset)
-    predictor, scorer = policy.dipn_predictor(dipn, slots), policy.grasp_scorer(gn)
-    appraise = policy.grasp_appraiser(gn) if fast else planner.plain(policy.plain_scorer(gn))
-    options: dict[str, Any] = {"count": count, "slots": slots, "distance": 0.1, "rule": ALWAYS, "appraise": appraise}
+    predictor, scorer = predictors.dipn_predictor(dipn), scorers.cautious_scorer(gn)
+    summarize = scorers.grasp_summary(gn) if fast else planner.summarize_whole(scorers.plain_scorer(gn))
 
     def decide(seen: Observation, key: int) -> Decision:
-        return jax.device_get(planner.decide(jax.random.key(key), seen, predictor, scorer, **options))
+        random = jax.random.key(key)
+        return jax.device_get(
+            planner.decide(random, seen, predictor, scorer, count=count, rule=ALWAYS, summarize=summarize)
+        )
 
     return decide
 
 
 def speed(setting: Setting) -> Iterator[tuple[str, float]]:
     """Seconds a decision on a scene of ten objects, all of whose candidates are considered."""
-    seen, slots = _seen("10", 4, setting.seed)
+    seen = _seen("10", 4, setting.seed)
     tables = [structs.take(seen, i) for i in range(4)]
     for count in COUNTS:
-        decide = _decider("compact", slots, count, fast=True)
+        decide = _decider("compact", count, fast=True)
         decide(tables[0], 0)
         taken = seconds(functools.partial(_all, decide, tables)) / len(tables)
         yield f"decide.speed/compact_{count}", taken
     few = setting.pick(2, 4)
-    each = _paper_one_by_one(tables[0], slots, few)
-    whole = _paper_whole(tables[0], slots, few)
+    each = _paper_one_by_one(tables[0], few)
+    whole = _paper_whole(tables[0], few)
     for count in COUNTS:
         yield f"decide.speed/paper_{count}", whole * (1 + count)
-    decide = _decider("compact", slots, 64, fast=True)
+    decide = _decider("compact", 64, fast=True)
     decide(tables[0], 0)
     ours = seconds(lambda: _all(decide, tables)) / len(tables)
     yield "decide.speed/paper_one_by_one_64", each * 65
@@ -90,24 +93,24 @@ def _all(decide: Callable[[Observation, int], Decision], tables: list[Observatio
         decide(table, 0)
 
 
-def _imagined(seen: Observation, slots: int, count: int, predictor: Any) -> Callable[[int], jax.Array]:
+def _imagined(seen: Observation, count: int, predictor: Any) -> Callable[[int], jax.Array]:
     """The image after candidate `i`, each predicted by itself."""
     seen = jax.tree.map(jnp.asarray, seen)
-    pushes, _ = candidates.sample_pushes(jax.random.key(0), seen, count=count, slots=slots, distance=0.1)
+    pushes, _ = candidates.sample_pushes(jax.random.key(0), seen, count=count, distance=0.1)
 
     @jax.jit
     def one(push: Push) -> jax.Array:
         motion = predictor(seen, jax.tree.map(lambda leaf: leaf[None], push))[0]
-        centers, _ = masks.mask_centers(seen.label, slots)
+        centers, _ = masks.mask_centers(seen.label, seen.slots)
         return render.rgbd(imagine.imagine(seen, centers, motion))
 
     return lambda i: one(structs.take(pushes, i))
 
 
-def _paper_one_by_one(seen: Observation, slots: int, count: int) -> float:
+def _paper_one_by_one(seen: Observation, count: int) -> float:
     """Seconds an image of the published networks, one candidate and one rotation at a time."""
     dipn, gn = _networks("paper")
-    image_after = _imagined(seen, slots, count, policy.dipn_predictor(dipn, slots))
+    image_after = _imagined(seen, count, predictors.dipn_predictor(dipn))
     graph, state = nnx.split(gn)
 
     @jax.jit
@@ -126,11 +129,11 @@ def _paper_one_by_one(seen: Observation, slots: int, count: int) -> float:
     return seconds(work) / count
 
 
-def _paper_whole(seen: Observation, slots: int, count: int) -> float:
+def _paper_whole(seen: Observation, count: int) -> float:
     """Seconds an image of the published networks, all rotations of it in one call."""
     dipn, gn = _networks("paper")
-    image_after = _imagined(seen, slots, count, policy.dipn_predictor(dipn, slots))
-    mean = jax.jit(lambda image: policy.plain_scorer(gn)(image[None]).mean())
+    image_after = _imagined(seen, count, predictors.dipn_predictor(dipn))
+    mean = jax.jit(lambda image: scorers.plain_scorer(gn)(image[None]).mean())
 
     def work() -> None:
         for i in range(count):
@@ -144,8 +147,8 @@ def fast_path(setting: Setting) -> Iterator[tuple[str, float]]:
     """How often the fast path decides as the plain one, and how many times faster it is, with 64 candidates."""
     each, same, pushed = setting.pick(10, 125), [], []
     for objects, packed in KINDS:
-        seen, slots = _seen(objects, each, setting.seed, packed=packed)
-        plain, fast = (_decider("compact", slots, 64, fast=quick) for quick in (False, True))
+        seen = _seen(objects, each, setting.seed, packed=packed)
+        plain, fast = (_decider("compact", 64, fast=quick) for quick in (False, True))
         tables = [structs.take(seen, i) for i in range(each)]
         pairs = [(plain(table, i), fast(table, i)) for i, table in enumerate(tables)]
         same += [_same(*pair) for pair in pairs]
@@ -169,8 +172,8 @@ def in_lockstep(setting: Setting) -> Iterator[tuple[str, float]]:
     """Episodes of the hard instances a minute, side by side, over one after the other."""
     engine, path = make_engine("native"), cases.hard_cases_path()
     slots, repeats = int(cases.load_cases(path)[1].shape.shape[1]), setting.pick(1, 3)
-    nets = methods.Nets(BUILTIN, BUILTIN)
-    decide = methods.load(methods.Plan(), nets, engine, slots=slots)
+    networks = methods.Networks(BUILTIN, BUILTIN)
+    (decide,) = on_tables.load("dipn+gn", networks, engine, [methods.PolicyConfig()])
 
     def tables() -> list[instances.Instance]:
         return instances.hard_instances(engine, path, None, slots=slots, repeats=repeats, seed=setting.seed)

@@ -23,14 +23,14 @@ def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Ste
     from flax import nnx
 
     from dipn_jax.networks import losses
-    from dipn_jax.planning import policy
+    from dipn_jax.planning import scorers
     from dipn_jax.storage import checkpoint
 
     model: Any = checkpoint.build("grasp", GraspConfig(preset=preset))
     if work == "score":
         model.eval()
         parameters = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
-        scorer, image = jax.jit(policy.plain_scorer(model)), jnp.asarray(arrays["image"])[None]
+        scorer, image = jax.jit(scorers.plain_scorer(model)), jnp.asarray(arrays["image"])[None]
         return lambda: scorer(image).block_until_ready(), parameters
     images, pixel, success = (jnp.asarray(arrays[name]) for name in ("images", "pixel", "success"))
 

@@ -22,7 +22,7 @@ from benchmarks.worker import versus
 from dipn_jax import structs
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.physics import make_engine
-from dipn_jax.planning import candidates, policy
+from dipn_jax.planning import candidates, predictors
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint
 from dipn_jax.world import clutter, scenes
@@ -102,13 +102,13 @@ def input_share(setting: Setting) -> Iterator[tuple[str, float]]:
 
 def batched(setting: Setting) -> Iterator[tuple[str, float]]:
     """Seconds of one call for each candidate over one call for all: 64 pushes of a scene of 10 objects."""
-    items = clutter.settled_exactly(jax.random.key(setting.seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
+    items = clutter.settled_scenes(jax.random.key(setting.seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
     seen = jax.tree.map(lambda leaf: leaf[0], render.observe(items.scene, items.poses))
     key = jax.random.key(setting.seed)
-    pushes, _ = candidates.sample_pushes(key, seen, count=CANDIDATES, slots=OBJECTS, distance=0.1)
+    pushes, _ = candidates.sample_pushes(key, seen, count=CANDIDATES, distance=0.1)
     network: Any = checkpoint.build("dipn", DipnConfig())
     network.eval()
-    predict = jax.jit(policy.dipn_predictor(network, OBJECTS))
+    predict = jax.jit(predictors.dipn_predictor(network))
     each = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], pushes) for i in range(CANDIDATES)]
     together = lambda: jax.block_until_ready(predict(seen, pushes))  # noqa: E731
     one_by_one = lambda: jax.block_until_ready([predict(seen, push) for push in each])  # noqa: E731

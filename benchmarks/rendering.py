@@ -58,7 +58,8 @@ class RayCaster:
         label = np.where(slot < 0, ABSENT, slot).reshape(-1, side, side)
         height = np.where(label < 0, 0.0, CAMERA - distance.reshape(label.shape))
         color = self.palette[np.arange(len(label))[:, None, None], label]  # ABSENT is the last: the table
-        return Observation(height.astype(np.float32), color.astype(np.float32), label.astype(np.int32))
+        slots = self.palette.shape[1] - 1
+        return Observation(height.astype(np.float32), color.astype(np.float32), label.astype(np.int32), slots)
 
 
 def _same(ours: Observation, theirs: Observation) -> None:
@@ -70,7 +71,7 @@ def _same(ours: Observation, theirs: Observation) -> None:
 def vs_raycast(setting: Setting) -> Iterator[tuple[str, float]]:
     """Seconds of the ray caster over seconds of the renderer."""
     key = jax.random.key(setting.seed)
-    items = clutter.settled_exactly(key, make_engine("native"), scenes.fixed_count(OBJECTS), BATCH)
+    items = clutter.settled_scenes(key, make_engine("native"), scenes.fixed_count(OBJECTS), BATCH)
     caster = RayCaster(items)
     scene: Scene = jax.tree.map(jax.numpy.asarray, items.scene)
     poses = jax.numpy.asarray(items.poses)

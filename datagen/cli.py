@@ -13,7 +13,7 @@ import tyro
 from dipn_jax import console
 from dipn_jax.engine import EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.planning import policy
+from dipn_jax.planning import scorers
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.storage import checkpoint, records
 from dipn_jax.world import scenes
@@ -134,7 +134,7 @@ def grasp(
         raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
     network: Any = checkpoint.load_network(grasp_net, network="grasp")
     job |= {"guided": guided, "hard": hard, "weights": checkpoint.digest(network)}
-    _generate("grasp", out, objects, ranges, work, scorer=policy.grasp_scorer(network), **job)
+    _generate("grasp", out, objects, ranges, work, scorer=scorers.cautious_scorer(network), **job)
 
 
 def images(

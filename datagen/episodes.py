@@ -68,15 +68,14 @@ def push_batch(
 
 def aim_pushes(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> tuple[Push, jax.Array]:
     """Random 10 cm pushes `[B, actions]` of what is seen of scenes `[B, N]` at `poses [B, N, 7]`; whether feasible."""
-    return batching.in_chunks(functools.partial(_aim_pushes, actions=actions), keys, scene, poses)
+    return batching.in_batches(functools.partial(_aim_pushes, actions=actions), keys, scene, poses)
 
 
 @functools.partial(jax.jit, static_argnames="actions")
 def _aim_pushes(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int) -> tuple[Push, jax.Array]:
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Push, jax.Array]:
-        slots = args[1].shape.shape[0]
         seen = render.render(*args[1:])
-        return candidates.sample_pushes(args[0], seen, count=actions, slots=slots, distance=PUSH_STEPS * 0.01)
+        return candidates.sample_pushes(args[0], seen, count=actions, distance=PUSH_STEPS * 0.01)
 
     return jax.lax.map(one, (keys, scene, poses))
 
@@ -124,7 +123,7 @@ def grasp_batch(
 
 def aim_grasps(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int, guide: Guide | None = None) -> Grasp:
     """Grasps `[B, actions]` of the foreground seen of scenes `[B, N]` at `poses [B, N, 7]`."""
-    return batching.in_chunks(functools.partial(_aim_grasps, actions=actions, guide=guide), keys, scene, poses)
+    return batching.in_batches(functools.partial(_aim_grasps, actions=actions, guide=guide), keys, scene, poses)
 
 
 @functools.partial(jax.jit, static_argnames=("actions", "guide"))

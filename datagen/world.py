@@ -105,7 +105,7 @@ def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
 def trial(key: jax.Array, engine: Engine, count: int) -> Trial:
     """`count` scenes of 1 to 7 objects, with a random feasible push and GRASPS random grasps of the foreground."""
     drop, aim = jax.random.split(key)
-    items = clutter.settled_exactly(drop, engine, scenes.SceneConfig(), max(2 * count, 8))
+    items = clutter.settled_scenes(drop, engine, scenes.SceneConfig(), max(2 * count, 8))
     keys = jax.random.split(aim, len(items.fault))
     pushes, feasible = episodes.aim_pushes(keys, items.scene, items.poses, actions=1)
     grasps = episodes.aim_grasps(keys, items.scene, items.poses, actions=GRASPS)
@@ -189,7 +189,7 @@ def agreement(name: str, engine: Engine, made: Trial, poses: np.ndarray, held: n
 
 def camera(key: jax.Array, engine: Engine, count: int) -> Metrics:
     """`camera/...`: the renderer against MuJoCo's ray caster on scenes of ten objects."""
-    items = clutter.settled_exactly(key, engine, scenes.fixed_count(10), count)
+    items = clutter.settled_scenes(key, engine, scenes.fixed_count(10), count)
     seen = jax.jit(lambda scene, poses: jax.lax.map(lambda pair: render.render_depth(*pair), (scene, poses)))
     height, label = (np.asarray(x) for x in seen(items.scene, jnp.asarray(items.poses)))
     wanted_height, wanted_label = native.raycast(items.scene, items.poses)

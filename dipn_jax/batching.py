@@ -15,7 +15,7 @@ FEW = 16
 """Rows taken at a time where a row costs much, or where few are left."""
 
 
-def in_chunks(function: Callable[..., Any], *args: Any) -> Any:
+def in_batches(function: Callable[..., Any], *args: Any) -> Any:
     """`function(*args)` for any number of rows: BATCH or FEW at a time, so that two compiled shapes serve all.
 
     Args:
@@ -35,8 +35,8 @@ def in_chunks(function: Callable[..., Any], *args: Any) -> Any:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
 
 
-def in_few(function: Callable[..., Any], *args: Any) -> Any:
-    """As `in_chunks`, FEW at a time, for functions that are dear: `function(*rows, real)` is told which rows count.
+def in_small_batches(function: Callable[..., Any], *args: Any) -> Any:
+    """As `in_batches`, FEW at a time, for functions that are dear: `function(*rows, real)` is told which rows count.
 
     Args:
       function: jitted, of pytrees with a leading axis, and of `real [FEW]` bool.

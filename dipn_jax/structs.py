@@ -62,16 +62,24 @@ class Fault:
 
 
 class Pytree:
-    """What `flax.struct.dataclass` adds, for the type checker."""
+    """What every struct can do: `replace` (added by `flax.struct.dataclass`), and indexing along the leading axis."""
 
     def replace(self, **changes: Any) -> Any:
         """A copy with some fields replaced."""
         raise NotImplementedError
 
+    def __getitem__(self, index: Any) -> Any:
+        """Row `index` of a batched struct, or the rows of a slice or an index array."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
 
 @flax.struct.dataclass
 class Scene(Pytree):
-    """What lies on the table, apart from where it lies."""
+    """What lies on the table, apart from where it lies.
+
+    names, scenes, poses = dipn_jax.load_cases()    # a dipn_jax.Scene with a leading axis
+    scenes[0].replace(friction=np.full(6, 0.2))
+    """
 
     shape: Array  # [N] int32: index into shapes.CLASSES, ABSENT where the slot is empty
     size: Array  # [N, 3] metres: bounding box along the object's own axes
@@ -82,16 +90,23 @@ class Scene(Pytree):
 
 @flax.struct.dataclass
 class Observation(Pytree):
-    """What the camera sees, orthographic, straight down."""
+    """What the camera sees, orthographic, straight down.
+
+    observation = dipn_jax.Observation(height, color, label, slots=10)
+    """
 
     height: Array  # [H, W] metres above the table
     color: Array  # [H, W, 3] in [0, 1]
     label: Array  # [H, W] int32: object slot, ABSENT on the table
+    slots: int = flax.struct.field(pytree_node=False)  # N: labels are below; static, as it shapes programs
 
 
 @flax.struct.dataclass
 class Push(Pytree):
-    """A straight horizontal sweep with the closed gripper."""
+    """A straight horizontal sweep with the closed gripper.
+
+    push = dipn_jax.Push(start=np.array([-0.1, 0.0]), angle=np.float32(0.0), distance=np.float32(0.1))
+    """
 
     start: Array  # [2] metres, workspace: where the gripper comes down
     angle: Array  # [] radians: direction of travel
@@ -100,7 +115,10 @@ class Push(Pytree):
 
 @flax.struct.dataclass
 class Grasp(Pytree):
-    """A top-down grasp."""
+    """A top-down grasp.
+
+    grasp = dipn_jax.Grasp(center=np.array([0.0, 0.05]), angle=np.float32(0.0), height=np.float32(0.02))
+    """
 
     center: Array  # [2] metres, workspace: midpoint between the fingers
     angle: Array  # [] radians: direction of the closing axis
@@ -166,21 +184,42 @@ class SettledScene(Pytree):
 
 
 @flax.struct.dataclass
-class Decision(Pytree):
-    """What the planner chose."""
+class Candidates(Pytree):
+    """What there is to choose from on one table: the best grasp, and pushes."""
 
-    is_push: Array  # [] bool
-    push: Push
+    pushes: Push  # [P]
+    feasible: Array  # [P] bool
     grasp_pixel: Array  # [3] int32: rotation, row, col of the best grasp
     grasp_score: Array  # [] score of that grasp in [0, 1]
+    value_now: Array  # [] mean score of all grasps
+    grasp_now: Array  # [] bool: the best grasp is to be taken, whatever pushes promise
+
+
+@flax.struct.dataclass
+class Decision(Pytree):
+    """What was chosen on one table, and what it was compared with.
+
+    decision = policy(key, observation)             # a dipn_jax.Decision
+    action = decision.push if decision.is_push else decision.grasp
+    """
+
+    is_push: Array  # [] bool
+    push: Push  # the best one
+    grasp: Grasp  # the best one
+    grasp_pixel: Array  # [3] int32: rotation, row, col of it
+    grasp_score: Array  # [] score of it in [0, 1], or its value
     value_now: Array  # [] mean score of all grasps now (of the cautious ones if no push was allowed)
     value_push: Array  # [] gamma times the mean score after the best push; -inf if none is feasible
-    predicted: Array  # [H, W, 4] predicted RGB and height after the best push
-    best: Array  # [] int32 index of the best push among the candidates
-    pushes: Push  # [P] all candidates
-    feasible: Array  # [P] bool
-    values: Array  # [P] gamma times the mean score after each candidate
     motion: Array  # [N, 3] predicted dx, dy (metres), dtheta (radians) for the best push
+    best: Array | None = None  # [] int32 index of the best push among the candidates
+    values: Array | None = None  # [P] gamma times the mean score after each candidate; -inf where not feasible
+    candidates: Candidates | None = None
+    predicted: Array | None = None  # [H, W, 4] predicted RGB and height after the best push
+
+    def brief(self) -> Decision:
+        """The decision without candidates and images: what is kept of many tables."""
+        brief: Decision = self.replace(best=None, values=None, candidates=None, predicted=None)
+        return brief
 
 
 def concatenate(batches: list[Any]) -> Any:

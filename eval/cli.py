@@ -13,7 +13,7 @@ from dipn_jax import console, files
 from dipn_jax.engine import EngineName
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
-from dipn_jax.planning import policy
+from dipn_jax.planning import scorers
 from dipn_jax.storage import checkpoint, resume
 from dipn_jax.world import scenes
 
@@ -135,7 +135,7 @@ def grasp(
     if run:
         physics = make_engine(engine)
         found, tables = success.evaluate(
-            policy.load_scorer(run), physics, config, partial, scenes=scenes_, seed=seed, others=others
+            scorers.load_scorer(run), physics, config, partial, scenes=scenes_, seed=seed, others=others
         )
         alone = success.label_agreement(physics, scenes.parse_objects("1", ranges=ranges), scenes=scenes_, seed=seed)
         values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}

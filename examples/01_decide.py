@@ -1,6 +1,7 @@
-"""Push or grasp? One decision on a hard table, by the networks that come with the package."""
+"""Push or grasp? Decide on one of the ten hard tables with the networks that come with the package."""
 
 import jax
+
 import dipn_jax
 
 names, scenes, poses = dipn_jax.load_cases()

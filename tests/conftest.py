@@ -30,7 +30,7 @@ def engine() -> Any:
 @pytest.fixture(scope="session")
 def settled(engine: Any) -> Any:
     """Six scenes of five objects at rest, numpy."""
-    return clutter.settled_exactly(jax.random.key(7), engine, scenes.fixed_count(SLOTS), 6)
+    return clutter.settled_scenes(jax.random.key(7), engine, scenes.fixed_count(SLOTS), 6)
 
 
 def _job(kind: str, episodes: int, actions: int) -> Job:

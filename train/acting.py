@@ -14,7 +14,7 @@ from flax import nnx
 from dipn_jax import structs
 from dipn_jax.engine import Engine
 from dipn_jax.networks.vpg import VPG
-from dipn_jax.planning import candidates, policy
+from dipn_jax.planning import candidates, scorers
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import fingers, render
 from dipn_jax.structs import Array, Fault, Grasp, Push, Pytree, Scene
@@ -66,7 +66,7 @@ def look(
     """What there is to do on each of the tables `[T]` that are `wanted [T]`; zeros of the others."""
     network: VPG = nnx.merge(graph, params, rest)
     network.eval()
-    pushes, grasps = policy.value_scorers(network)
+    pushes, grasps = scorers.value_scorers(network)
     grasps = scorer or grasps
 
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> Look:
@@ -76,8 +76,7 @@ def look(
         possible = fingers.pushable(seen.height)
         values = pushes(image)[0] if pushes else jnp.zeros(possible.shape)
         push_index, push_value = candidates.best_grasp(jnp.where(possible, values, -jnp.inf))
-        slots = args[1].shape.shape[0]
-        sampled, feasible = candidates.sample_pushes(push_key, seen, count=1, slots=slots, distance=distance)
+        sampled, feasible = candidates.sample_pushes(push_key, seen, count=1, distance=distance)
         where = candidates.push_index(jax.tree.map(lambda leaf: leaf[0], sampled))
         assert grasps is not None
         grasp_index, grasp_value = candidates.best_grasp(grasps(image)[0])

@@ -11,7 +11,7 @@ from dipn_jax.engine import EngineName
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.physics import make_engine
-from dipn_jax.planning import policy
+from dipn_jax.planning import scorers
 from dipn_jax.storage import checkpoint
 from dipn_jax.world import scenes
 
@@ -239,7 +239,7 @@ def baseline(
     learning = (tables, updates, batch, learning_rate, weight_decay, seed)
     config = baselines.BaselineConfig(method, preset, actions, *learning)
     gn: Any = checkpoint.load_network(grasp_net, network="grasp") if grasp_net else None
-    scored: dict[str, Any] = {"scorer": policy.grasp_scorer(gn), "scored_by": checkpoint.digest(gn)} if gn else {}
+    scored: dict[str, Any] = {"scorer": scorers.cautious_scorer(gn), "scored_by": checkpoint.digest(gn)} if gn else {}
     result = baselines.learn(make_engine(engine), scenes.parse_objects(objects), config, out, **scored)
     console.say(f"{out}: " + ", ".join(f"{name} {value:.3f}" for name, value in result.items()))
 

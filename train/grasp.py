@@ -125,7 +125,7 @@ def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
 
 def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
     """Windows `[B]`, `pixels` a side, of episodes `[B]`; numpy."""
-    return jax.device_get(batching.in_chunks(functools.partial(_windows, pixels=pixels), episodes))
+    return jax.device_get(batching.in_batches(functools.partial(_windows, pixels=pixels), episodes))
 
 
 def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array:
@@ -150,7 +150,7 @@ def view(batch: Window, begin: jax.Array) -> tuple[jax.Array, jax.Array]:
         cut = functools.partial(jax.lax.dynamic_slice, start_indices=corner, slice_sizes=(side, side))
         label = cut(window.label).astype(jnp.int32)
         height = cut(window.height).astype(jnp.float32)
-        return render.rgbd(Observation(height, render.paint_labels(label, window.color), label))
+        return render.rgbd(Observation(height, render.paint_labels(label, window.color), label, window.color.shape[0]))
 
     return jax.vmap(one)(batch, begin), wide // 2 - begin
 

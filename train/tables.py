@@ -69,7 +69,7 @@ def begin(engine: Engine, config: SceneConfig, *, count: int, seed: int) -> Tabl
 
 def _draw(engine: Engine, config: SceneConfig, seed: int, batch: int, count: int) -> SettledScene:
     """Twice as many tables as are in play."""
-    return clutter.settled_exactly(jax.random.fold_in(jax.random.key(seed), batch), engine, config, 2 * count)
+    return clutter.settled_scenes(jax.random.fold_in(jax.random.key(seed), batch), engine, config, 2 * count)
 
 
 def _replaced(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:

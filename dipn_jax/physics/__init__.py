@@ -78,7 +78,10 @@ def resolve(name: EngineName) -> EngineName:
 
 
 def make_engine(name: EngineName, *, timestep: float | None = None, sleep: float | None = None) -> Engine:
-    """The engine called `name`, with its own solver settings.
+    """Make the engine called `name`, with its own solver settings.
+
+        engine = dipn_jax.make_engine("native")
+        rollout = dipn_jax.world.primitives.push(engine, scenes, poses, pushes)
 
     Args:
       name: engine, or `auto`.

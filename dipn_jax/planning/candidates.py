@@ -20,26 +20,29 @@ STANDOFF = 15
 CENTER_RANGE = (25, 199)
 """Pixels: a centre predicted outside drops the push. Source: DIPN's released code."""
 
-CLEARANCE = 0.001  # metres between a fingertip and what it would press on
-GRIP = 0.015  # metres of an object that are between the fingers at least, whatever they press on; of a low one less:
-GIVE = 0.004  # metres by which the tips stop short for it; measured: 5 of 892 grasps threw an object out, 1 with it
+TIP_CLEARANCE = 0.001
+"""Metres between a fingertip and what it would otherwise press on."""
+MIN_GRIP_DEPTH = 0.015
+"""Metres of an object that are between the fingers at least, even where a finger then presses on something."""
+LOW_OBJECT_RAISE = 0.004
+"""Metres by which fingertips may stop short over an object that is too low for MIN_GRIP_DEPTH."""
 
-ALIKE, ALIKE_TURNS = 10.0, 1  # pixels and rotations by which a grasp differs at most from one that it is like
+SAME_GRASP_PIXELS = 10.0
+"""Pixels by which the centres of two grasps differ at most to count as the same grasp."""
+SAME_GRASP_ROTATIONS = 1
+"""Rotations (of 16) by which two grasps differ at most to count as the same grasp."""
 
 _OVERSAMPLE = 4
 
 
-@functools.partial(jax.jit, static_argnames=("count", "slots"))
-def sample_pushes(
-    key: jax.Array, observation: Observation, *, count: int, slots: int, distance: Array
-) -> tuple[Push, jax.Array]:
+@functools.partial(jax.jit, static_argnames="count")
+def sample_pushes(key: jax.Array, observation: Observation, *, count: int, distance: Array) -> tuple[Push, jax.Array]:
     """Candidate pushes of one observation.
 
     Args:
       key: random key.
       observation: `[224, 224]` maps.
       count: number of candidates P.
-      slots: number of object slots N in the labels.
       distance: metres, traced: one `[]`, or each candidate's own `[P]`.
 
     Returns:
@@ -53,7 +56,7 @@ def sample_pushes(
     width = label.shape[1]
     contact = geometry.pixels_to_metres(jnp.stack([index % width, index // width], -1))
     owner = jnp.maximum(label.reshape(-1)[index], 0)
-    centers, _ = masks.mask_centers(label, slots)
+    centers, _ = masks.mask_centers(label, observation.slots)
     toward = centers[owner] - contact
     angle = jnp.arctan2(toward[:, 1], toward[:, 0])
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
@@ -93,16 +96,17 @@ def stays_inside(centers: jax.Array, area: jax.Array, motion: jax.Array) -> jax.
 def grasp_at(index: Array, height: jax.Array) -> Grasp:
     """The grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres).
 
-    The tips go to `grasp_height`, or stop on what a finger meets on its way, as far up as leaves GRIP of the object
-    between them or is GIVE higher.
+    The tips go to `fingers.grasp_height`. Where a finger would press on something on its way there they stop above it,
+    but leave MIN_GRIP_DEPTH of the object between them at least, or rise LOW_OBJECT_RAISE over a low object.
     """
     index = jnp.asarray(index)
     rotation, row, col = index[..., 0], index[..., 1], index[..., 2]
     center = geometry.pixels_to_metres(jnp.stack([col, row], -1))
     angle = rotation * jnp.float32(2 * jnp.pi / ROTATIONS)
     local = height[row, col]
-    goal, contact = fingers.grasp_height(local), fingers.under_fingers(height, center, angle) + CLEARANCE
-    return Grasp(center, angle, jnp.maximum(goal, jnp.minimum(contact, jnp.maximum(local - GRIP, goal + GIVE))))
+    goal, contact = fingers.grasp_height(local), fingers.under_fingers(height, center, angle) + TIP_CLEARANCE
+    highest = jnp.maximum(local - MIN_GRIP_DEPTH, goal + LOW_OBJECT_RAISE)
+    return Grasp(center, angle, jnp.maximum(goal, jnp.minimum(contact, highest)))
 
 
 def grasp_index(grasp: Grasp) -> jax.Array:
@@ -126,7 +130,7 @@ def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Gr
 def sample_grasps(
     key: jax.Array, observation: Observation, scores: jax.Array, *, count: int, guided: Array, hard: Array
 ) -> Grasp:
-    """`count` grasps of what a scorer thinks of: some it believes in, some it is unsure of, the others anywhere.
+    """Draw `count` grasps: some that a scorer believes in, some that it is unsure of, the others at random.
 
     Args:
       key: random key.
@@ -162,8 +166,8 @@ def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
     return index, scores.reshape(-1)[flat]
 
 
-def doubted(scores: jax.Array, missed: Array) -> jax.Array:
-    """Scores `[16, H, W]`, halved near grasps that missed, once for each.
+def discount_missed(scores: jax.Array, missed: Array) -> jax.Array:
+    """Halve scores `[16, H, W]` near grasps that missed, once for each of them.
 
     Args:
       scores: of grasps, now.
@@ -172,15 +176,15 @@ def doubted(scores: jax.Array, missed: Array) -> jax.Array:
     missed = jnp.asarray(missed)
     half = ROTATIONS // 2  # a grasp turned by half a turn is the same grasp
     turned = jnp.abs((jnp.arange(ROTATIONS)[:, None] - missed[:, 0] + half // 2) % half - half // 2)
-    alike = (turned <= ALIKE_TURNS) & (missed[:, 0] >= 0)
+    alike = (turned <= SAME_GRASP_ROTATIONS) & (missed[:, 0] >= 0)
     away = geometry.view_grid(*scores.shape[1:]) - missed[:, None, None, :0:-1]
-    near = jnp.linalg.norm(away, axis=-1) <= ALIKE
+    near = jnp.linalg.norm(away, axis=-1) <= SAME_GRASP_PIXELS
     count = jnp.einsum("rm,mhw->rhw", alike.astype(scores.dtype), near.astype(scores.dtype))
     return jnp.minimum(scores, scores * 0.5**count)
 
 
 def best_grasps(scores: jax.Array, *, count: int, apart: float = 8.0) -> jax.Array:
-    """The best of scores `[16, H, W]`, then the best that is `apart` pixels from it, and so on: `[count, 3]`."""
+    """The `count` best of scores `[16, H, W]` that are at least `apart` pixels from one another: `[count, 3]`."""
     grid = geometry.view_grid(*scores.shape[1:])
 
     def next_best(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:

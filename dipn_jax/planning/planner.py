@@ -1,7 +1,7 @@
 """Push or grasp? Alg. 2 of the paper, and the rule of two score maps. Predictor and scorer arrive as functions.
 
-`decide` is one jitted call: candidates, predicted images and the scores of every grasp on each of them
-never leave the device. Its two halves, `propose` and `choose`, are for predictors that are no function of an image.
+`decide` is one jitted call: candidates, predicted images and the scores of every grasp on each of them never leave the
+device. Its two halves are `find_candidates` and `decide_among`; they serve predictors that are no function of an image.
 """
 
 from __future__ import annotations
@@ -16,56 +16,49 @@ import numpy as np
 
 from dipn_jax.planning import candidates
 from dipn_jax.sight import fingers, imagine, masks, render
-from dipn_jax.structs import Array, Decision, Observation, Push, Pytree
+from dipn_jax.structs import Array, Candidates, Decision, Observation, Push, Pytree
 
 Predictor = Callable[[Observation, Push], jax.Array]
 """(observation, pushes [P]) -> motion [P, N, 3]: dx, dy (metres) of each mask's centroid, dtheta (radians)."""
 Scorer = Callable[[jax.Array], jax.Array]
 """images [M, 224, 224, 4] -> scores [M, 16, 224, 224] in [0, 1]."""
-Appraiser = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+ScoreSummary = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 """(image now [224, 224, 4], images [P, ...], wanted [P] bool) -> mean and highest of all scores on each, [1 + P] both.
 
-The first are those of the image now. Of images that are not wanted it may say anything finite."""
+Index 0 is the image now. Images that are not wanted may get any finite numbers."""
 
 NONE_MISSED = np.full((1, 3), -1, np.int32)
 """No grasp has missed."""
-STILL = (0.001, np.deg2rad(1.0))
-"""Metres and radians of a predicted motion that is not drawn: half a pixel at an object's centre and at its end."""
+UNDRAWN_SHIFT = 0.001
+"""Metres: a predicted motion that is smaller, and turns by less than UNDRAWN_TURN, is not drawn (half a pixel)."""
+UNDRAWN_TURN = np.deg2rad(1.0)
+"""Radians; see UNDRAWN_SHIFT. At the end of an object that is half a pixel, too."""
 
 
 @flax.struct.dataclass
 class Rule(Pytree):
-    """How Alg. 2 decides; every field is traced. The defaults are the paper's rule."""
+    """How Alg. 2 decides; every field is traced. The defaults are the paper's rule.
+
+    decision = dipn_jax.decide(key, observation, predictor, scorer, rule=dipn_jax.Rule(gamma=0.8))
+    """
 
     gamma: Array = 0.9  # discount of a push's value
-    threshold: Array = 0.7  # grasp at once if the best score is higher; 1 switches the short cut off
-    reach: Array = 1.0  # of a predicted motion, when it is judged whether an object leaves the workspace
+    grasp_above: Array = 0.7  # grasp at once if the best score is higher; 1 switches this short cut off
+    edge_factor: Array = 1.0  # a predicted motion is multiplied by it to judge whether an object leaves the workspace
     # clauses that only DIPN's released code has
-    several: Array = False  # a lone object is grasped
-    better: Array = False  # a push must raise the best score, too
-    sure: Array = 0.0  # gamma discounts only pushes after which the best score is over this (released code: 0.5)
+    grasp_lone: Array = False  # a lone object is grasped
+    push_must_raise_best: Array = False  # a push must raise the best score, too
+    discount_above: Array = 0.0  # gamma discounts only pushes after which the best score is higher (released: 0.5)
 
 
-RELEASED = Rule(reach=2.0, several=True, better=True, sure=0.5)
+RELEASED = Rule(edge_factor=2.0, grasp_lone=True, push_must_raise_best=True, discount_above=0.5)
 """The rule of DIPN's released code, which predicts 5 cm of a push and makes 10."""
 
 
-@flax.struct.dataclass
-class Proposal(Pytree):
-    """What there is to choose from."""
+def summarize_whole(scorer: Scorer) -> ScoreSummary:
+    """The summary that scores every wanted image whole."""
 
-    pushes: Push  # [P]
-    feasible: Array  # [P] bool
-    grasp_pixel: Array  # [3] int32: rotation, row, col of the best grasp
-    grasp_score: Array  # [] its score
-    value_now: Array  # [] mean score of all grasps
-    settled: Array  # [] bool: the best grasp is to be taken, whatever pushes promise
-
-
-def plain(scorer: Scorer) -> Appraiser:
-    """Every image scored whole."""
-
-    def appraise(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def summarize(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(args: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             image, want = args
             nothing = (jnp.zeros(()), jnp.zeros(()))
@@ -74,51 +67,50 @@ def plain(scorer: Scorer) -> Appraiser:
         every, asked = jnp.concatenate([now[None], images]), jnp.append(wanted.any(), wanted)
         return jax.lax.map(one, (every, asked))
 
-    return appraise
+    return summarize
 
 
 def _mean_and_best(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
     return scores.mean(), scores.max()
 
 
-def propose(
+def find_candidates(
     key: jax.Array,
     observation: Observation,
     scorer: Scorer,
     rule: Rule,
     *,
     count: int,
-    slots: int,
     distance: Array,
     missed: Array = NONE_MISSED,
-) -> Proposal:
-    """Score the grasps, and sample `count` pushes; arguments as of `decide`."""
+) -> Candidates:
+    """Score all grasps and sample `count` pushes; arguments as of `decide`."""
     now = scorer(render.rgbd(observation)[None])[0]
-    index, best = candidates.best_grasp(candidates.doubted(now, missed))
-    pushes, feasible = candidates.sample_pushes(key, observation, count=count, slots=slots, distance=distance)
-    _, area = masks.mask_centers(observation.label, slots)
-    alone = jnp.asarray(rule.several) & ((area > 0).sum() < 2)
-    settled = (best > rule.threshold) | alone
-    return Proposal(pushes, feasible, index, best, now.mean(), settled)
+    index, best = candidates.best_grasp(candidates.discount_missed(now, missed))
+    pushes, feasible = candidates.sample_pushes(key, observation, count=count, distance=distance)
+    _, area = masks.mask_centers(observation.label, observation.slots)
+    lone = jnp.asarray(rule.grasp_lone) & ((area > 0).sum() < 2)
+    return Candidates(pushes, feasible, index, best, now.mean(), (best > rule.grasp_above) | lone)
 
 
-def choose(
-    observation: Observation, proposal: Proposal, motion: jax.Array, appraise: Appraiser, rule: Rule
+def decide_among(
+    observation: Observation, found: Candidates, motion: jax.Array, summarize: ScoreSummary, rule: Rule
 ) -> Decision:
-    """Push or grasp, given what each push would do.
+    """Choose between the best grasp and the best push, given what each push would do.
 
     Args:
       observation: what the camera sees now.
-      proposal: of `propose`.
+      found: candidates, of `find_candidates`.
       motion: `[P, N, 3]` dx, dy (metres) of each mask's centroid, dtheta (radians).
-      appraise: what all grasps on an image are worth.
+      summarize: mean and highest score of all grasps on images.
       rule: how to compare.
     """
-    centers, area = masks.mask_centers(observation.label, motion.shape[1])
-    small = (jnp.linalg.norm(motion[..., :2], axis=-1) < STILL[0]) & (jnp.abs(motion[..., 2]) < STILL[1])
+    centers, area = masks.mask_centers(observation.label, observation.slots)
+    small = jnp.linalg.norm(motion[..., :2], axis=-1) < UNDRAWN_SHIFT
+    small &= jnp.abs(motion[..., 2]) < UNDRAWN_TURN
     drawn = jnp.where(small[..., None], 0.0, motion)
-    inside = jax.vmap(candidates.stays_inside, in_axes=(None, None, 0))(centers, area, rule.reach * motion)
-    allowed = proposal.feasible & inside & ~proposal.settled
+    inside = jax.vmap(candidates.stays_inside, in_axes=(None, None, 0))(centers, area, rule.edge_factor * motion)
+    allowed = found.feasible & inside & ~found.grasp_now
     now = render.rgbd(observation)
 
     def imagined(args: tuple[jax.Array, jax.Array]) -> jax.Array:
@@ -127,43 +119,45 @@ def choose(
         )
 
     images = jax.lax.map(imagined, (drawn, allowed))
-    means, tops = appraise(now, images, allowed)
-    mean, highest = means[1:], tops[1:]
-    value_now = jnp.where(allowed.any(), means[0], proposal.value_now)
-    taken = allowed & (~jnp.asarray(rule.better) | ((highest > tops[0]) & (mean > means[0])))
-    value = jnp.where(taken, jnp.where(highest > rule.sure, rule.gamma, 1.0) * mean, -jnp.inf)
+    means, highest = summarize(now, images, allowed)
+    mean, top = means[1:], highest[1:]
+    value_now = jnp.where(allowed.any(), means[0], found.value_now)
+    taken = allowed & (~jnp.asarray(rule.push_must_raise_best) | ((top > highest[0]) & (mean > means[0])))
+    value = jnp.where(taken, jnp.where(top > rule.discount_above, rule.gamma, 1.0) * mean, -jnp.inf)
     best = jnp.argmax(jnp.where(taken, mean, -jnp.inf)).astype(jnp.int32)
     return Decision(
         is_push=value[best] > value_now,
-        push=jax.tree.map(lambda leaf: leaf[best], proposal.pushes),
-        grasp_pixel=proposal.grasp_pixel,
-        grasp_score=proposal.grasp_score,
+        push=found.pushes[best],
+        grasp=candidates.grasp_at(found.grasp_pixel, observation.height),
+        grasp_pixel=found.grasp_pixel,
+        grasp_score=found.grasp_score,
         value_now=value_now,
         value_push=value[best],
-        predicted=images[best],
-        best=best,
-        pushes=proposal.pushes,
-        feasible=allowed,
-        values=value,
         motion=motion[best],
+        best=best,
+        values=value,
+        candidates=found.replace(feasible=allowed),
+        predicted=images[best],
     )
 
 
-@functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "slots", "appraise"))
+@functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "summarize"))
 def decide(
     key: jax.Array,
     observation: Observation,
     predictor: Predictor,
     scorer: Scorer,
     *,
-    count: int,
-    slots: int,
-    distance: Array,
+    count: int = 32,
+    distance: Array = 0.1,
     rule: Rule = Rule(),  # noqa: B008
-    appraise: Appraiser | None = None,
+    summarize: ScoreSummary | None = None,
     missed: Array = NONE_MISSED,
 ) -> Decision:
-    """Choose between the best grasp and the best push.
+    """Choose between the best grasp and the best push (Alg. 2 of the paper).
+
+        predictor, scorer = policy.load_predictor("builtin"), policy.load_scorer("builtin")
+        decision = dipn_jax.decide(jax.random.key(0), observation, predictor, scorer)
 
     Args:
       key: random key, for the candidates.
@@ -171,64 +165,63 @@ def decide(
       predictor: motions of every object for every candidate.
       scorer: scores of every grasp on every image.
       count: number of candidate pushes P.
-      slots: number of object slots N in the labels.
       distance: push distance, metres: one `[]`, or each candidate's own `[P]`.
       rule: how to compare.
-      appraise: what all grasps on a predicted image are worth; every image is scored whole by default.
-      missed: `[M, 3]` grasps that missed on this table as it is; see `candidates.doubted`.
+      summarize: mean and highest score of all grasps on images; every image is scored whole by default.
+      missed: `[M, 3]` grasps that missed on this table as it is; see `candidates.discount_missed`.
 
     Returns:
       The decision. A push is chosen when gamma times the mean score of all grasps on its predicted image
       exceeds the mean score now; a push that would move any centre out of the workspace is dropped.
     """
-    proposal = propose(key, observation, scorer, rule, count=count, slots=slots, distance=distance, missed=missed)
-    still = lambda: jnp.zeros((count, slots, 3))  # noqa: E731
-    motion = jax.lax.cond(proposal.settled, still, lambda: predictor(observation, proposal.pushes))
-    return choose(observation, proposal, motion, appraise or plain(scorer), rule)
+    found = find_candidates(key, observation, scorer, rule, count=count, distance=distance, missed=missed)
+    still = lambda: jnp.zeros((count, observation.slots, 3))  # noqa: E731
+    motion = jax.lax.cond(found.grasp_now, still, lambda: predictor(observation, found.pushes))
+    return decide_among(observation, found, motion, summarize or summarize_whole(scorer), rule)
 
 
-@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer", "slots"))
-def compare(
+@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer"))
+def decide_by_value(
     observation: Observation,
     push_scorer: Scorer,
     scorer: Scorer,
     *,
-    slots: int,
     distance: jax.Array | float,
-    threshold: jax.Array | float = jnp.inf,
+    grasp_above: jax.Array | float = jnp.inf,
     missed: Array = NONE_MISSED,
 ) -> Decision:
-    """Choose without imagining, as VPG does: the best of all grasps, or the best of all pushes.
+    """Choose the best of all grasps or the best of all pushes by their values, imagining nothing, as VPG does.
 
     Args:
       observation: what the camera sees now.
       push_scorer: values of pushes that start at each pixel in each of 16 directions.
       scorer: values of grasps.
-      slots: number of object slots N in the labels.
       distance: push distance, metres.
-      threshold: grasp at once if the best grasp's value is higher.
+      grasp_above: grasp at once if the best grasp's value is higher.
       missed: `[M, 3]` as of `decide`.
 
     Returns:
       The decision; its only candidate is the best push that the closed gripper can begin.
     """
     image = render.rgbd(observation)
-    index, grasp_value = candidates.best_grasp(candidates.doubted(scorer(image[None])[0], missed))
+    pixel, grasp_value = candidates.best_grasp(candidates.discount_missed(scorer(image[None])[0], missed))
     possible = fingers.pushable(observation.height)
     values = jnp.where(possible, push_scorer(image[None])[0], -jnp.inf)
     where, push_value = candidates.best_grasp(values)
     push = candidates.push_at(where, distance)
+    grasp_now = grasp_value > grasp_above
+    only = jax.tree.map(lambda leaf: leaf[None], push)
     return Decision(
-        is_push=(push_value > grasp_value) & (grasp_value <= threshold),
+        is_push=(push_value > grasp_value) & ~grasp_now,
         push=push,
-        grasp_pixel=index,
+        grasp=candidates.grasp_at(pixel, observation.height),
+        grasp_pixel=pixel,
         grasp_score=grasp_value,
         value_now=grasp_value,
         value_push=push_value,
-        predicted=image,
+        motion=jnp.zeros((observation.slots, 3)),
         best=jnp.zeros((), jnp.int32),
-        pushes=jax.tree.map(lambda leaf: leaf[None], push),
-        feasible=possible.any()[None],
         values=push_value[None],
-        motion=jnp.zeros((slots, 3)),
+        candidates=Candidates(only, possible.any()[None], pixel, grasp_value, grasp_value, grasp_now),
+        predicted=image,
     )

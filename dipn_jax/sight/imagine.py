@@ -16,7 +16,10 @@ WINDOW = 80
 
 @jax.jit
 def imagine(observation: Observation, centers: jax.Array, motion: jax.Array) -> Observation:
-    """The observation after every object has moved rigidly in the plane.
+    """Predict the observation after every object has moved rigidly in the plane.
+
+        centers, _ = dipn_jax.sight.masks.mask_centers(observation.label, observation.slots)
+        after = dipn_jax.imagine(observation, centers, motion)
 
     Args:
       observation: `[224, 224]` maps before.
@@ -45,7 +48,7 @@ def imagine(observation: Observation, centers: jax.Array, motion: jax.Array) -> 
     table = jnp.array([*render.TABLE_COLOR, 0.0, ABSENT], jnp.float32)
     image = jnp.broadcast_to(table, (pixels, pixels, 5))
     image = jax.lax.fori_loop(0, centers.shape[0], paint, image)
-    return Observation(image[..., 3], image[..., :3], image[..., 4].astype(jnp.int32))
+    return Observation(image[..., 3], image[..., :3], image[..., 4].astype(jnp.int32), observation.slots)
 
 
 def move_toward(label: jax.Array, start: jax.Array, angle: jax.Array) -> jax.Array:

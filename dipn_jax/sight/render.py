@@ -96,9 +96,14 @@ def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixe
 
 @functools.partial(jax.jit, static_argnames=("pixels",))
 def render(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> Observation:
-    """What the camera sees of one scene; arguments as `render_depth`."""
+    """Render what the camera sees of one scene; arguments as `render_depth`.
+
+    names, scenes, poses = dipn_jax.load_cases()
+    observation = dipn_jax.render(scenes[0], poses[0])
+    every = jax.vmap(dipn_jax.render)(scenes, poses)
+    """
     height, label = render_depth(scene, poses, pixels=pixels)
-    return Observation(height, paint_labels(label, scene.color), label)
+    return Observation(height, paint_labels(label, scene.color), label, scene.shape.shape[0])
 
 
 def paint_labels(label: jax.Array, color: jax.Array) -> jax.Array:
@@ -114,10 +119,10 @@ def rgbd(observation: Observation) -> jax.Array:
 
 def observe(scene: Scene, poses: Array) -> Observation:
     """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
-    return batching.in_chunks(_observe, scene, poses)
+    return batching.in_batches(_observe, scene, poses)
 
 
 @jax.jit
 def _observe(scene: Scene, poses: jax.Array) -> Observation:
     height, label = jax.lax.map(lambda pair: render_depth(*pair), (scene, poses))
-    return Observation(height, jax.vmap(paint_labels)(label, scene.color), label)
+    return Observation(height, jax.vmap(paint_labels)(label, scene.color), label, scene.shape.shape[1])

@@ -196,8 +196,11 @@ def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
     return folder
 
 
-def load_network(run: pathlib.Path, *, network: str) -> nnx.Module:
-    """The network of the newest whole step, in evaluation mode.
+def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Module:
+    """Load the network of the newest whole step of a run, in evaluation mode.
+
+        dipn = dipn_jax.load_network(network="dipn")             # comes with the package
+        mine = dipn_jax.load_network("runs/gn", network="grasp")
 
     Args:
       run: a run's folder, or `builtin`.
@@ -206,7 +209,7 @@ def load_network(run: pathlib.Path, *, network: str) -> nnx.Module:
     Raises:
       UserError: no run there, no whole step in it, or it holds another network.
     """
-    run = find(run, network=network)
+    run = find(pathlib.Path(run), network=network)
     if not run.is_dir():
         raise UserError(f"checkpoint {run}: no such folder; give the --out of a dipn-train run")
     found = newest(run)

@@ -269,6 +269,24 @@ def summary(folder: pathlib.Path) -> dict[str, Any]:
     }
 
 
+def read_episodes(folder: pathlib.Path | str) -> Any:
+    """Read a whole data set: a PushEpisode, GraspEpisode or SettledScene with a leading `[B]`, as numpy.
+
+        pushes = dipn_jax.read_episodes("data/push")
+        pushes.poses.shape                                       # [B, 11, N, 7]: at every centimetre of each push
+        observation = dipn_jax.render(pushes.scene[0], pushes.poses[0, 0])
+
+    Args:
+      folder: what `dipn-datagen push`, `grasp` or `images` wrote.
+
+    Raises:
+      UserError: there is no data set, or a shard of it is damaged.
+    """
+    folder = pathlib.Path(folder)
+    episodes, _ = load(folder, kind=str(summary(folder)["kind"]))
+    return episodes
+
+
 def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
     """A whole data set in memory (a few kilobytes an episode), after checking every shard.
 

@@ -22,11 +22,17 @@ def hard_cases_path() -> pathlib.Path:
     return pathlib.Path(__file__).parents[1] / "data" / "hard_cases.json"
 
 
-def load_cases(path: pathlib.Path, *, slots: int | None = None) -> tuple[list[str], Scene, np.ndarray]:
-    """Read a case file (the format of `hard_cases.json`).
+def load_cases(
+    path: pathlib.Path | str | None = None, *, slots: int | None = None
+) -> tuple[list[str], Scene, np.ndarray]:
+    """Read a case file: hand-placed scenes in the format of `hard_cases.json`.
+
+        names, scenes, poses = dipn_jax.load_cases()             # the ten hard tables
+        names, scenes, poses = dipn_jax.load_cases("mine.json")
+        observation = dipn_jax.render(scenes[0], poses[0])
 
     Args:
-      path: JSON file with `cases`, each a name and a list of objects.
+      path: JSON file with `cases`, each a name and a list of objects; by default the ten hard tables of the paper.
       slots: padded number of objects; the largest case's by default.
 
     Returns:
@@ -35,6 +41,7 @@ def load_cases(path: pathlib.Path, *, slots: int | None = None) -> tuple[list[st
     Raises:
       UserError: the file is missing, is not JSON, or an object in it has an unknown shape or a wrong size.
     """
+    path = hard_cases_path() if path is None else pathlib.Path(path)
     try:
         cases = json.loads(path.read_text())["cases"]
     except OSError as error:

@@ -32,7 +32,7 @@ def settled(
       The scenes kept `[K]`, and how many were dropped and why others were not kept.
     """
     draw = functools.partial(_random_scenes, config=config)
-    scene, poses = jax.tree.map(np.asarray, batching.in_chunks(draw, jax.random.split(key, count)))
+    scene, poses = jax.tree.map(np.asarray, batching.in_batches(draw, jax.random.split(key, count)))
     rollout = primitives.settle(engine, scene, poses, fence=primitives.FENCE_TIME)
     fault = np.asarray(rollout.fault)
     everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)
@@ -40,8 +40,12 @@ def settled(
     return structs.take(everything, fault == 0), {"dropped_scenes": count, **counts}
 
 
-def settled_exactly(key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
-    """`count` scenes at rest, however many drops it takes.
+def settled_scenes(key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
+    """Drop random objects until `count` scenes have come to rest.
+
+        engine, config = dipn_jax.make_engine("native"), dipn_jax.SceneConfig()
+        tables = dipn_jax.settled_scenes(jax.random.key(0), engine, config, 16)
+        observation = dipn_jax.render(tables.scene[0], tables.poses[0])
 
     Raises:
       UserError: `MAX_DROPS` drops in a row gave none.

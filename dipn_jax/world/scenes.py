@@ -66,7 +66,10 @@ DEFAULT_RANGES = Ranges()
 
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
-    """What random scenes are made of."""
+    """What random scenes are made of.
+
+    config = dipn_jax.SceneConfig(slots=10, counts=(0.1,) * 10)   # 1 to 10 objects, all as likely
+    """
 
     slots: int = 7  # padded number of objects
     counts: tuple[float, ...] = PAPER_COUNTS  # probability of 1, 2, ... objects

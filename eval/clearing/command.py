@@ -12,16 +12,18 @@ from dipn_jax import console
 from dipn_jax.engine import Engine, EngineName
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
-from dipn_jax.planning import policy
-from dipn_jax.storage import checkpoint, resume
+from dipn_jax.planning import predictors
+from dipn_jax.planning.methods import LONGEST_PUSH, MethodName, Networks, PolicyConfig
+from dipn_jax.storage import resume
 from dipn_jax.world import scenes
 
 from .. import metrics, options
-from . import lockstep, methods, sweeping
+from . import lockstep, on_tables, sweeping
 from .instances import Tables
+from .on_tables import TablePolicy
 
 MAX_CANDIDATES = 4096
-LONG = 0.10
+SIMULATED_PUSH = 0.10
 """Metres of a push that are simulated at least: a shorter one is looked at when a long one has ended."""
 
 
@@ -30,7 +32,7 @@ DEFAULT_TABLES = Tables()
 
 def clear(
     out: pathlib.Path,
-    method: methods.MethodName = "dipn+gn",
+    method: MethodName = "dipn+gn",
     push_net: pathlib.Path | None = None,
     grasp_net: pathlib.Path | None = None,
     value_net: pathlib.Path | None = None,
@@ -77,30 +79,21 @@ def clear(
     """
     settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
     del settings["tables"]
-    plan = _plan(out, seed, method, candidates, (distance,), gamma, threshold, released)
-    plan = dataclasses.replace(plan, cautious=cautious, remember=remember)
-    nets, physics = methods.Nets(push_net, grasp_net, value_net), make_engine(engine)
-    decide = methods.load(plan, nets, physics, slots=tables.slots())
-    _cleared(out, decide, physics, tables, settings, nets.require(method), longest=max(distance, LONG))
-
-
-def _plan(
-    out: pathlib.Path,
-    seed: int,
-    method: methods.MethodName,
-    candidates: int,
-    distances: tuple[float, ...],
-    gamma: float,
-    threshold: float,
-    released: bool,
-) -> methods.Plan:
-    """The plan of options that make sense."""
     options.check(out, seed, candidates=candidates)
-    console.require_between(1, MAX_CANDIDATES, candidates=candidates)
-    for distance in distances:
-        console.require_between(0.01, methods.LONGEST, distance=distance)
-    console.require_between(0.0, 10.0, gamma=gamma, threshold=threshold)
-    return methods.Plan(method, candidates, distances, gamma, threshold, released)
+    config = PolicyConfig(candidates, (distance,), gamma, threshold, released, cautious)
+    _check(config)
+    networks, physics = Networks(push_net, grasp_net, value_net), make_engine(engine)
+    (decide,) = on_tables.load(method, networks, physics, [config])
+    longest = max(distance, SIMULATED_PUSH)
+    _cleared(out, decide, physics, tables, settings, networks.runs(method), longest=longest, remember=remember)
+
+
+def _check(config: PolicyConfig) -> None:
+    """UserError for options that make no sense."""
+    console.require_between(1, MAX_CANDIDATES, candidates=config.candidates)
+    for distance in config.distances:
+        console.require_between(0.01, LONGEST_PUSH, distance=distance)
+    console.require_between(0.0, 10.0, gamma=config.gamma, threshold=config.grasp_above)
 
 
 def sweep(
@@ -142,21 +135,23 @@ def sweep(
     if candidates < len(every):
         raise UserError(f"--candidates {candidates}: want at least one for each of the {len(every)} distances")
     each = {sweeping.name(distance): (distance,) for distance in every} | {sweeping.CHOSEN: every}
-    plans = [_plan(out, seed, "dipn+gn", candidates, spread, gamma, threshold, False) for spread in each.values()]
-    nets = methods.Nets(push_net, grasp_net)
-    physics = make_engine(engine)
-    runs = nets.require("dipn+gn")
+    options.check(out, seed, candidates=candidates)
+    configs = [PolicyConfig(candidates, spread, gamma, threshold) for spread in each.values()]
+    for config in configs:
+        _check(config)
+    networks, physics = Networks(push_net, grasp_net), make_engine(engine)
+    runs = networks.runs("dipn+gn")
     kept = resume.Partial(out, settings, inputs=_inputs(runs, tables))
     ended: dict[str, dict[str, Any]] = kept.load({})
-    deciders = methods.load_each(plans, nets, physics, slots=tables.slots())
-    for name, decide in zip(each, deciders, strict=True):
+    policies = on_tables.load("dipn+gn", networks, physics, configs)
+    for name, decide in zip(each, policies, strict=True):
         if name not in ended:
             mine = settings | {"label": name}
             ended[name] = _cleared(out / name, decide, physics, tables, mine, runs, longest=max(every))
             kept.save(ended)
     values = {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
     if pushes:
-        predictor = policy.load_predictor(checkpoint.find(push_net, network="dipn"), scenes.PAPER.slots)
+        predictor = predictors.load_predictor(push_net)
         measure: dict[str, Any] = {"scenes": pushes, "seed": seed, "longest": max(every)}
         values |= sweeping.prediction_errors(predictor, physics, scenes.PAPER, every, **measure)
     sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
@@ -173,18 +168,20 @@ def _inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]
 
 def _cleared(
     out: pathlib.Path,
-    decide: methods.Decider,
+    decide: TablePolicy,
     physics: Engine,
     tables: Tables,
     settings: dict[str, Any],
     runs: dict[str, pathlib.Path],
     *,
     longest: float,
+    remember: bool = True,
 ) -> dict[str, Any]:
     """Clear tables and write what came of it; goes on where it was interrupted."""
     seed = settings["seed"]
     partial = resume.Partial(out, settings, inputs=_inputs(runs, tables))
-    ended = lockstep.clear(tables.make(physics, seed=seed), physics, decide, partial, seed=seed, longest=longest)
+    instances = tables.make(physics, seed=seed)
+    ended = lockstep.clear(instances, physics, decide, partial, seed=seed, longest=longest, remember=remember)
     lockstep.save(ended, out)
     values = lockstep.summary(ended)
     options.finish(out, values, settings, partial)

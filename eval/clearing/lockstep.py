@@ -14,32 +14,35 @@ from dipn_jax import console, files, geometry, structs
 from dipn_jax.engine import Engine
 from dipn_jax.planning import planner
 from dipn_jax.storage import resume
-from dipn_jax.structs import Fault
+from dipn_jax.structs import Decision, Fault
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 from dipn_jax.world import clutter, primitives
 
 from .. import metrics
 from . import film
-from .choices import Choice
 from .instances import Instance
-from .methods import Decider
+from .on_tables import TablePolicy
 
 ACTIONS_PER_OBJECT = 3
 """Source: the paper; more actions than that is a failure."""
-MISSES = 8
-"""Grasps that missed which are kept in mind, the latest."""
-STAYED, AROUND = 0.005, 0.06
-"""Metres: what has moved by more, so near the centre of a grasp that missed, makes it worth trying again."""
+REMEMBERED_MISSES = 8
+"""How many of the latest grasps that missed are remembered."""
+MOVED_DISTANCE = 0.005
+"""Metres: an object that has moved by more makes grasps near it worth trying again."""
+NEAR_GRASP = 0.06
+"""Metres: how far from the centre of a grasp an object counts as near it."""
+_NONE_MISSED = np.repeat(planner.NONE_MISSED, REMEMBERED_MISSES, axis=0)
 
 
 def clear(
     instances: list[Instance],
     engine: Engine,
-    decide: Decider,
+    decide: TablePolicy,
     partial: resume.Partial,
     *,
     seed: int,
     longest: float = PUSH_STEPS * 0.01,
+    remember: bool = True,
 ) -> list[Instance]:
     """Act on every instance until all have ended; those that have not are decided on, and simulated, together.
 
@@ -52,6 +55,7 @@ def clear(
       partial: where an interrupted evaluation is kept.
       seed: of the push candidates.
       longest: metres of the longest push that `decide` asks for.
+      remember: tell `decide` of the grasps that missed around which nothing has moved since.
 
     Returns:
       The instances, ended.
@@ -65,14 +69,15 @@ def clear(
             before = sum(instance.removed for instance in instances)
             scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
             now = jnp.stack([jax.random.fold_in(keys[number], instances[number].actions) for number in active])
-            choice = decide(now, scene, poses, np.stack([_missed(row) for row in rows]))
+            missed = np.stack([_missed(row) if remember else _NONE_MISSED for row in rows])
+            decision = decide(now, scene, poses, missed)
             for is_push, act in ((True, functools.partial(_push, longest=longest)), (False, _grasp)):
-                which = np.flatnonzero(choice.is_push == is_push)
+                which = np.flatnonzero(decision.is_push == is_push)
                 if len(which):
-                    act([rows[i] for i in which], structs.take(choice, which), engine)
+                    act([rows[i] for i in which], decision[which], engine)
             for i, instance in enumerate(rows):
-                _remember(instance, (scene.shape[i], poses[i]), structs.take(choice, i))
-                _doubt(instance, (scene.shape[i], poses[i]), choice.grasp_pixel[i])
+                _record(instance, (scene.shape[i], poses[i]), decision[i])
+                _update_missed(instance, (scene.shape[i], poses[i]), decision.grasp_pixel[i])
                 instance.ended = instance.ended or _ended(instance)
             partial.save(instances)
             removed = sum(instance.removed for instance in instances) - before
@@ -81,9 +86,9 @@ def clear(
     return instances
 
 
-def _push(rows: list[Instance], choice: Choice, engine: Engine, *, longest: float) -> None:
+def _push(rows: list[Instance], decision: Decision, engine: Engine, *, longest: float) -> None:
     scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
-    rollout = primitives.push(engine, scene, poses, choice.push, longest=longest)
+    rollout = primitives.push(engine, scene, poses, decision.push, longest=longest)
     wrong = ~Fault.usable(rollout.fault)
     for i, instance in enumerate(rows):
         instance.pushes += 1
@@ -92,9 +97,9 @@ def _push(rows: list[Instance], choice: Choice, engine: Engine, *, longest: floa
         instance.did.append("push")
 
 
-def _grasp(rows: list[Instance], choice: Choice, engine: Engine) -> None:
+def _grasp(rows: list[Instance], decision: Decision, engine: Engine) -> None:
     scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
-    scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, choice.grasp)
+    scene, rested, held, fault = clutter.grasp_away(engine, scene, poses, decision.grasp)
     wrong = ~Fault.usable(fault)
     for i, instance in enumerate(rows):
         instance.grasps += 1
@@ -105,34 +110,35 @@ def _grasp(rows: list[Instance], choice: Choice, engine: Engine) -> None:
         instance.did.append("grasp held" if held[i].any() else "grasp missed")
 
 
-def _remember(instance: Instance, state: tuple[np.ndarray, np.ndarray], choice: Choice) -> None:
+def _record(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: Decision) -> None:
     """Keep what a frame can be drawn from again: where everything was, and what was decided."""
-    push = choice.push
+    push = decision.push
     instance.film.append(
         {
             "shape": state[0],
             "poses": state[1],
             "push": np.array([*push.start, push.angle, push.distance], np.float32),
-            "grasp": choice.grasp_pixel,
-            "values": choice.values.astype(np.float32),
-            "motion": choice.motion.astype(np.float32),
+            "grasp": decision.grasp_pixel,
+            "values": np.array([decision.grasp_score, decision.value_now, decision.value_push], np.float32),
+            "motion": decision.motion.astype(np.float32),
         }
     )
 
 
 def _missed(instance: Instance) -> np.ndarray:
-    """The grasps that are doubted, padded: `[MISSES, 3]`."""
-    return np.stack([*instance.missed, *[planner.NONE_MISSED[0]] * (MISSES - len(instance.missed))])
+    """The grasps that missed, padded: `[REMEMBERED_MISSES, 3]`."""
+    return np.stack([*instance.missed, *_NONE_MISSED[len(instance.missed) :]])
 
 
-def _doubt(instance: Instance, state: tuple[np.ndarray, np.ndarray], grasp: np.ndarray) -> None:
+def _update_missed(instance: Instance, state: tuple[np.ndarray, np.ndarray], grasp: np.ndarray) -> None:
     """Keep in mind a grasp that missed, and forget those around which something has moved or is gone."""
     shape, poses = state
     missed = instance.missed + ((grasp,) if instance.did[-1] == "grasp missed" else ())
-    stayed = np.linalg.norm(instance.poses[:, :2] - poses[:, :2], axis=-1) < STAYED
+    stayed = np.linalg.norm(instance.poses[:, :2] - poses[:, :2], axis=-1) < MOVED_DISTANCE
     moved = poses[(shape >= 0) & ~(stayed & (instance.scene.shape >= 0)), :2]
     apart = [np.linalg.norm(moved - np.asarray(geometry.pixels_to_metres(each[:0:-1])), axis=-1) for each in missed]
-    instance.missed = tuple(each for each, away in zip(missed, apart, strict=True) if (away > AROUND).all())[-MISSES:]
+    kept = tuple(each for each, away in zip(missed, apart, strict=True) if (away > NEAR_GRASP).all())
+    instance.missed = kept[-REMEMBERED_MISSES:]
 
 
 def _ended(instance: Instance) -> str:

@@ -78,9 +78,9 @@ def prediction_errors(
       `sweep/DISTANCE/push_error/{all,moved}` with bootstrap 95 % intervals over scenes.
     """
     key, aim = jax.random.split(jax.random.key(seed))
-    items = clutter.settled_exactly(key, engine, config, scenes)
+    items = clutter.settled_scenes(key, engine, config, scenes)
     keys = jax.random.split(aim, scenes)
-    seen, pushes, feasible = batching.in_chunks(_look, keys, items.scene, items.poses)
+    seen, pushes, feasible = batching.in_batches(_look, keys, items.scene, items.poses)
     rows = np.flatnonzero(feasible)
     seen, pushes = structs.take(seen, rows), structs.take(pushes, rows)
     scene, poses = structs.take(items.scene, rows), items.poses[rows]
@@ -91,7 +91,7 @@ def prediction_errors(
             rollout = primitives.push(engine, scene, poses, each, longest=longest)
             after = np.asarray(rollout.poses)[:, -1]
             measure = functools.partial(_errors, predictor=predictor)
-            error, visible, moved = batching.in_chunks(measure, seen, each, scene, poses, after)
+            error, visible, moved = batching.in_batches(measure, seen, each, scene, poses, after)
             good = Fault.usable(rollout.fault)[:, None]
             for which, mask in (("all", visible), ("moved", moved)):
                 counted = np.asarray(mask) & good
@@ -106,7 +106,7 @@ def prediction_errors(
 def _look(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Observation, Push, jax.Array]:
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Observation, Push, jax.Array]:
         seen = render.render(*args[1:])
-        pushes, feasible = candidates.sample_pushes(args[0], seen, count=1, slots=args[2].shape[0], distance=0.1)
+        pushes, feasible = candidates.sample_pushes(args[0], seen, count=1, distance=0.1)
         return seen, jax.tree.map(lambda leaf: leaf[0], pushes), feasible[0]
 
     return jax.lax.map(one, (keys, scene, poses))

@@ -14,7 +14,7 @@ import numpy as np
 
 from dipn_jax import batching, console, structs
 from dipn_jax.engine import Engine
-from dipn_jax.planning import candidates
+from dipn_jax.planning import candidates, methods
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import render
 from dipn_jax.sight.fingers import label_image
@@ -24,7 +24,7 @@ from dipn_jax.world import clutter, primitives
 from dipn_jax.world.scenes import SceneConfig
 
 from .. import metrics
-from ..clearing import instances, lockstep, methods
+from ..clearing import instances, lockstep, on_tables
 from ..clearing.instances import Instance
 
 BINS = 10
@@ -56,7 +56,7 @@ def evaluate(
     """
     tables = instances.random_instances(engine, config, count=scenes, seed=seed)
     result = _random_foreground(scorer, engine, tables, seed)
-    tables = lockstep.clear(tables, engine, methods.best_grasp(scorer, slots=config.slots), partial, seed=seed)
+    tables = lockstep.clear(tables, engine, on_tables.in_lockstep(methods.grasping_policy(scorer)), partial, seed=seed)
     held = [np.array([did == "grasp held" for did in table.did], float) for table in tables]
     scores = np.concatenate([[step["values"][0] for step in table.film] for table in tables])
     result |= _rate("gn", [each.sum() for each in held], [len(each) for each in held])
@@ -79,7 +79,7 @@ def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], s
     scene = structs.stack([table.scene for table in tables])
     poses = np.stack([table.poses for table in tables])
     keys = jax.random.split(jax.random.key(seed), len(tables))
-    grasps, scores = batching.in_chunks(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
+    grasps, scores = batching.in_batches(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
     rollout, outcome = primitives.grasp(engine, scene, poses, jax.device_get(grasps))
     good = Fault.usable(rollout.fault)
     success = np.asarray(outcome.success, float)[good]
@@ -111,7 +111,7 @@ def _other_grasps(scorer: Scorer, engine: Engine, tables: list[Instance], count:
     if not states:
         return result
     scene, poses = structs.stack([state[0] for state in states]), np.stack([state[1] for state in states])
-    grasps = batching.in_chunks(functools.partial(_next_best, scorer=scorer, count=count), scene, poses)
+    grasps = batching.in_batches(functools.partial(_next_best, scorer=scorer, count=count), scene, poses)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     index = np.repeat(np.arange(len(states)), count)
     held, begin = [], 0
@@ -152,9 +152,9 @@ def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: i
       seed: of scenes and grasps.
       each: grasps on every scene.
     """
-    items = clutter.settled_exactly(jax.random.key(seed), engine, config, scenes)
+    items = clutter.settled_scenes(jax.random.key(seed), engine, config, scenes)
     keys = jax.random.split(jax.random.key(seed), scenes)
-    grasps, labels = batching.in_chunks(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
+    grasps, labels = batching.in_batches(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     index = np.repeat(np.arange(scenes), each)
     rollout, outcome = primitives.grasp(engine, structs.take(items.scene, index), items.poses[index], flat)

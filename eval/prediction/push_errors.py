@@ -16,7 +16,8 @@ from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
 from dipn_jax.networks.dipn import DIPN
-from dipn_jax.planning import candidates, policy
+from dipn_jax.planning import candidates
+from dipn_jax.planning.predictors import dipn_motions, static_predictor, trans_predictor
 from dipn_jax.sight import imagine, masks, render, segment
 from dipn_jax.storage import resume
 from dipn_jax.structs import Fault, Observation, Push, Scene, SettledScene
@@ -64,10 +65,10 @@ def evaluate(
       Flat metrics, and pictures `[F, ...]` of some pushes (before, predicted, after 10 cm).
     """
     slots = config.slots
-    predictors = {name: network_predictor(network, slots) for name, network in networks.items()}
+    predictors = {name: network_predictor(network) for name, network in networks.items()}
     predictors |= {
-        "static": _at_distances(policy.static_predictor(slots)),
-        "trans": _at_distances(policy.trans_predictor(slots)),
+        "static": _at_distances(static_predictor),
+        "trans": _at_distances(trans_predictor),
     }
     rows: Rows = {}
     films: list[dict[str, np.ndarray]] = []
@@ -76,7 +77,7 @@ def evaluate(
         empty = 0
         while done < scenes:
             drop, aim = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch))
-            items = clutter.settled_exactly(drop, engine, config, min(batching.BATCH, scenes - done))
+            items = clutter.settled_scenes(drop, engine, config, min(batching.BATCH, scenes - done))
             pushes, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)
             items, pushes, truth, rolled = _execute(engine, items, pushes, np.asarray(feasible), physics)
             if len(pushes.angle):
@@ -98,20 +99,18 @@ def evaluate(
     return _summary(rows, names, segmented), {k: np.stack([film[k] for film in films]) for k in films[0]}
 
 
-def network_predictor(network: DIPN, slots: int) -> Predict:
+def network_predictor(network: DIPN) -> Predict:
     """A network as it is measured here; networks of one architecture share a compiled function."""
     graph, state = nnx.split(network)
     distances = lambda count: np.broadcast_to(_METRES, (count, len(_METRES)))  # noqa: E731
-    return lambda seen, pushes: batching.in_chunks(
-        lambda *rows: _network_motions(graph, state, slots, *rows), seen, pushes, distances(len(pushes.angle))
+    return lambda seen, pushes: batching.in_batches(
+        lambda *rows: _network_motions(graph, state, *rows), seen, pushes, distances(len(pushes.angle))
     )
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2))
-def _network_motions(
-    graph: Any, state: Any, slots: int, seen: Observation, pushes: Push, distances: jax.Array
-) -> jax.Array:
-    return policy.dipn_motions(nnx.merge(graph, state), seen, pushes, distances, slots=slots)
+@functools.partial(jax.jit, static_argnums=0)
+def _network_motions(graph: Any, state: Any, seen: Observation, pushes: Push, distances: jax.Array) -> jax.Array:
+    return dipn_motions(nnx.merge(graph, state), seen, pushes, distances)
 
 
 def _at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict:
@@ -125,7 +124,7 @@ def _at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predic
 
         return jax.lax.map(one, (seen, pushes))
 
-    return lambda seen, pushes: batching.in_chunks(predict, seen, pushes)
+    return lambda seen, pushes: batching.in_batches(predict, seen, pushes)
 
 
 def _execute(
@@ -146,7 +145,7 @@ def _execute(
 
 
 def _one_push(keys: jax.Array, scene: Scene, poses: Any) -> tuple[Push, jax.Array]:
-    return batching.in_chunks(_push_each, keys, scene, poses)
+    return batching.in_batches(_push_each, keys, scene, poses)
 
 
 @jax.jit
@@ -154,8 +153,7 @@ def _push_each(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Push, j
     def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Push, jax.Array]:
         key, one_scene, one_poses = args
         seen = render.render(one_scene, one_poses)
-        slots = one_scene.shape.shape[0]
-        pushes, feasible = candidates.sample_pushes(key, seen, count=1, slots=slots, distance=PUSH_STEPS * 0.01)
+        pushes, feasible = candidates.sample_pushes(key, seen, count=1, distance=PUSH_STEPS * 0.01)
         return jax.tree.map(lambda leaf: leaf[0], pushes), feasible[0]
 
     return jax.lax.map(one, (keys, jax.tree.map(jnp.asarray, scene), jnp.asarray(poses)))
@@ -198,7 +196,7 @@ def measure(
       rolled: `[B, K, N, 7]` poses after nominal pushes, measured as `physics`.
     """
     slots = truth.shape[2]
-    centers, motion = batching.in_chunks(_true_motion, seen.label, truth)
+    centers, motion = batching.in_batches(_true_motion, seen.label, truth)
     if not suffix:
         visible = np.asarray((true.label[..., None] == np.arange(slots)).any((1, 2)))
         rows.setdefault("visible", []).append(np.repeat(visible[:, None], len(DISTANCES), 1))
@@ -206,9 +204,9 @@ def measure(
     motions = {name: predictor(seen, pushes) for name, predictor in predictors.items()}
     if rolled is not None:
         before_rolled = np.concatenate([truth[:, :1], rolled], 1)
-        motions["physics"] = batching.in_chunks(_true_motion, seen.label, before_rolled)[1]
+        motions["physics"] = batching.in_batches(_true_motion, seen.label, before_rolled)[1]
     for name, predicted in motions.items():
-        errors = batching.in_chunks(_errors, seen, centers, predicted, motion, after)
+        errors = batching.in_batches(_errors, seen, centers, predicted, motion, after)
         for key, value in errors.items():
             rows.setdefault(f"{name}{suffix}/{key}", []).append(np.asarray(value))
     return np.asarray(next(iter(motions.values())))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dipn_jax import geometry, structs
-from dipn_jax.planning import candidates, policy
+from dipn_jax.planning import candidates, predictors, scorers
 from dipn_jax.sight import masks, render
 from dipn_jax.storage import checkpoint
 from dipn_jax.world import primitives
@@ -20,13 +20,13 @@ def test_the_builtin_push_network_knows_what_a_push_does(settled: Any, engine: A
     """On three scenes of five objects, against the engine: far better than to say that nothing moves."""
     scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]
     seen = render.observe(scene, poses)
-    sample = jax.vmap(lambda key, one: candidates.sample_pushes(key, one, count=1, slots=5, distance=0.1))
+    sample = jax.vmap(lambda key, one: candidates.sample_pushes(key, one, count=1, distance=0.1))
     pushes, feasible = sample(jax.random.split(jax.random.key(0), 3), seen)
     pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], pushes)
     assert feasible.all()
     network: Any = checkpoint.load_network(pathlib.Path("builtin"), network="dipn")
     distances = np.tile(np.array([0.05, 0.1], np.float32), (3, 1))
-    told = policy.dipn_motions(network, seen, pushes, distances, slots=5)
+    told = predictors.dipn_motions(network, seen, pushes, distances)
     rolled = np.asarray(primitives.push(engine, scene, poses, pushes).poses)
     centers = jax.vmap(lambda label: masks.mask_centers(label, 5)[0])(seen.label)
     true = geometry.planar_motion(rolled[:, :1], rolled[:, [5, 10]], centers[:, None])
@@ -37,7 +37,7 @@ def test_the_builtin_push_network_knows_what_a_push_does(settled: Any, engine: A
 
 
 def test_the_builtin_grasp_network_grasps(settled: Any, engine: Any) -> None:
-    scorer = policy.load_scorer(pathlib.Path("builtin"))
+    scorer = scorers.load_scorer("builtin")
     seen = jax.tree.map(np.asarray, render.observe(settled.scene, settled.poses))
     images = jax.vmap(render.rgbd)(seen)
     scores = jax.jit(scorer)(images)

@@ -35,7 +35,7 @@ def test_centroids_are_opencvs(settled: Any) -> None:
 
 def test_feasible_pushes_start_free_inside_and_aim_at_an_object(settled: Any) -> None:
     seen = _seen(settled)
-    pushes, feasible = candidates.sample_pushes(jax.random.key(0), seen, count=16, slots=5, distance=0.1)
+    pushes, feasible = candidates.sample_pushes(jax.random.key(0), seen, count=16, distance=0.1)
     assert feasible[:4].all() and (np.diff(np.asarray(feasible).astype(int)) <= 0).all(), "feasible ones first"
     pixel = np.asarray(geometry.metres_to_pixels(pushes.start))[feasible]
     assert pixel.min() >= 10 and pixel.max() <= 214
@@ -50,15 +50,15 @@ def test_feasible_pushes_start_free_inside_and_aim_at_an_object(settled: Any) ->
 
 def test_other_key_other_pushes_same_key_same_pushes(settled: Any) -> None:
     seen = _seen(settled)
-    draw = [candidates.sample_pushes(jax.random.key(k), seen, count=16, slots=5, distance=0.1)[0] for k in (0, 0, 1)]
+    draw = [candidates.sample_pushes(jax.random.key(k), seen, count=16, distance=0.1)[0] for k in (0, 0, 1)]
     np.testing.assert_array_equal(draw[0].start, draw[1].start)
     assert not np.array_equal(draw[0].start, draw[2].start)
 
 
 def test_an_empty_table_has_no_feasible_push() -> None:
     zero = jnp.zeros((224, 224))
-    seen = Observation(zero, jnp.zeros((224, 224, 3)), jnp.full((224, 224), ABSENT))
-    _, feasible = candidates.sample_pushes(jax.random.key(0), seen, count=16, slots=5, distance=0.1)
+    seen = Observation(zero, jnp.zeros((224, 224, 3)), jnp.full((224, 224), ABSENT), 5)
+    _, feasible = candidates.sample_pushes(jax.random.key(0), seen, count=16, distance=0.1)
     assert not feasible.any()
 
 
@@ -99,7 +99,7 @@ def test_a_grasp_is_where_its_index_says() -> None:
 
 def test_guided_grasps_are_where_the_scores_are_high_and_hard_ones_where_they_are_half() -> None:
     label = jnp.full((224, 224), ABSENT).at[50:150, 50:150].set(0)
-    seen = Observation(jnp.where(label == 0, 0.05, 0.0), jnp.zeros((224, 224, 3)), label)
+    seen = Observation(jnp.where(label == 0, 0.05, 0.0), jnp.zeros((224, 224, 3)), label, 1)
     scores = jnp.full((16, 224, 224), 1e-3).at[5, 60:64, 60:64].set(0.99).at[9, 120:124, 120:124].set(0.5)
     scores = scores.at[2, :40, :40].set(0.999)  # on the table: nothing to grasp
 
@@ -120,12 +120,12 @@ def test_the_best_grasps_stand_apart() -> None:
 def test_grasps_like_one_that_missed_are_doubted() -> None:
     scores = jnp.full((16, 64, 64), 0.8)
     missed = np.array([[15, 30, 20], [15, 30, 24], [-1, -1, -1]])
-    found = np.asarray(candidates.doubted(scores, missed))
+    found = np.asarray(candidates.discount_missed(scores, missed))
     for rotation, row, col, share in ((15, 30, 20, 4), (7, 30, 20, 4), (0, 30, 20, 4), (6, 30, 20, 4), (1, 30, 20, 1)):
         assert found[rotation, row, col] == pytest.approx(0.8 / share)
     for row, col, share in ((30, 33, 2), (41, 20, 1), (30, 12, 2), (23, 30, 2)):
         assert found[15, row, col] == pytest.approx(0.8 / share), (row, col)
-    np.testing.assert_array_equal(candidates.doubted(scores, np.full((2, 3), -1)), scores)
+    np.testing.assert_array_equal(candidates.discount_missed(scores, np.full((2, 3), -1)), scores)
 
 
 def test_a_push_can_begin_where_the_footprint_is_free(settled: Any) -> None:
@@ -144,7 +144,7 @@ def test_a_push_can_begin_where_the_footprint_is_free(settled: Any) -> None:
 
 def test_each_candidate_may_have_its_own_distance(settled: Any) -> None:
     distances = np.linspace(0.03, 0.1, 8, dtype=np.float32)
-    pushes, _ = candidates.sample_pushes(jax.random.key(0), _seen(settled), count=8, slots=5, distance=distances)
+    pushes, _ = candidates.sample_pushes(jax.random.key(0), _seen(settled), count=8, distance=distances)
     np.testing.assert_array_equal(pushes.distance, distances)
 
 

@@ -62,7 +62,7 @@ def test_the_higher_object_hides_the_lower() -> None:
     height = jnp.where(label == 0, 0.02, jnp.where(label == 1, 0.05, 0.0))
     from dipn_jax.structs import Observation
 
-    seen = Observation(height, jnp.zeros((224, 224, 3)), label)
+    seen = Observation(height, jnp.zeros((224, 224, 3)), label, 2)
     centers, _ = masks.mask_centers(label, 2)
     onto = jnp.array([[0.08, 0.0, 0.0], [0.0, 0.0, 0.0]])
     after = imagine.imagine(seen, centers, onto)

@@ -10,27 +10,26 @@ import pytest
 
 from dipn_jax import structs
 from dipn_jax.networks import local
-from dipn_jax.planning import planner, policy
+from dipn_jax.planning import planner, predictors, scorers
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Decision, Observation
 
-COUNT, SLOTS = 32, 5
+COUNT = 32
 
 
 @pytest.fixture(scope="module")
 def scores() -> dict[str, Any]:
     builtin = pathlib.Path("builtin")
     gn: Any = checkpoint.load_network(builtin, network="grasp")
-    predictor = policy.load_predictor(builtin, SLOTS)
-    scorer = policy.plain_scorer(gn)
-    fast = policy.grasp_appraiser(gn)
+    predictor = predictors.load_predictor(builtin)
+    scorer = scorers.plain_scorer(gn)
+    fast = scorers.grasp_summary(gn)
 
     def decide(seen: Observation, quick: bool) -> Decision:
-        options: dict[str, Any] = {"count": COUNT, "slots": SLOTS, "distance": 0.1}
-        rule = planner.Rule(threshold=1.0)
+        rule = planner.Rule(grasp_above=1.0)
         return planner.decide(
-            jax.random.key(0), seen, predictor, scorer, rule=rule, appraise=fast if quick else None, **options
+            jax.random.key(0), seen, predictor, scorer, count=COUNT, rule=rule, summarize=fast if quick else None
         )
 
     return {"decide": decide, "gn": gn}
@@ -42,11 +41,11 @@ def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled
     for i in range(6):
         table = structs.take(seen, i)
         plain, fast = (jax.device_get(scores["decide"](table, quick)) for quick in (False, True))
-        many += plain.feasible.sum() > local.FEW
-        np.testing.assert_array_equal(plain.feasible, fast.feasible)
+        many += plain.candidates.feasible.sum() > local.FEW
+        np.testing.assert_array_equal(plain.candidates.feasible, fast.candidates.feasible)
         assert plain.best == fast.best and plain.is_push == fast.is_push
-        equal = np.isclose(plain.values, fast.values, rtol=1e-4) & plain.feasible
-        assert equal.sum() >= min(local.FINALISTS, plain.feasible.sum())
+        equal = np.isclose(plain.values, fast.values, rtol=1e-4) & plain.candidates.feasible
+        assert equal.sum() >= min(local.FINALISTS, plain.candidates.feasible.sum())
     assert many, "every image was scored whole"
 
 
@@ -57,7 +56,7 @@ def test_rough_means_rank_nearly_as_whole_images_do(settled: Any, scores: dict[s
     others = np.repeat(now[None], 8, 0)
     for k in range(8):  # a block of one colour and height at different places
         others[k, 20 + 20 * k : 45 + 20 * k, 30:80] = [0.5, 0.2, 0.2, 0.04]
-    whole, _ = planner.plain(policy.plain_scorer(scores["gn"]))(now, others, np.ones(8, bool))
+    whole, _ = planner.summarize_whole(scorers.plain_scorer(scores["gn"]))(now, others, np.ones(8, bool))
     whole = whole[1:]
     before = jax.jit(lambda image: local.scores_now(scores["gn"], image))(now)
 

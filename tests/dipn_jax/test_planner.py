@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dipn_jax import structs
-from dipn_jax.planning import candidates, planner, policy
+from dipn_jax.planning import candidates, planner, predictors
 from dipn_jax.sight import fingers, masks, render
 from dipn_jax.structs import Observation, Push
 
@@ -38,7 +38,7 @@ def bare_squared(images: jax.Array) -> jax.Array:
     return jnp.broadcast_to(jnp.exp(-20 * share)[:, None, None, None], (images.shape[0], 16, 224, 224))
 
 
-static = policy.static_predictor(SLOTS)
+static = predictors.static_predictor
 
 
 def away(observation: Observation, pushes: Push) -> jax.Array:
@@ -52,12 +52,11 @@ def seen(settled: Any) -> Observation:
 
 
 def _decide(seen: Observation, predictor: Any, scorer: Any, **rule: Any) -> Any:
-    options = {"count": COUNT, "slots": SLOTS, "distance": 0.1, "rule": planner.Rule(**rule)}
-    return planner.decide(jax.random.key(0), seen, predictor, scorer, **options)
+    return planner.decide(jax.random.key(0), seen, predictor, scorer, count=COUNT, rule=planner.Rule(**rule))
 
 
 def test_a_sure_grasp_is_taken_at_once(seen: Observation) -> None:
-    decision = _decide(seen, static, covered, threshold=0.01)
+    decision = _decide(seen, static, covered, grasp_above=0.01)
     assert not decision.is_push
     row, col = np.unravel_index(np.argmax(seen.height), (224, 224))
     assert decision.grasp_pixel.tolist() == [0, row, col]
@@ -65,60 +64,63 @@ def test_a_sure_grasp_is_taken_at_once(seen: Observation) -> None:
 
 
 def test_a_push_that_changes_nothing_is_not_worth_it(seen: Observation) -> None:
-    decision = _decide(seen, static, covered, threshold=1.0)
+    decision = _decide(seen, static, covered, grasp_above=1.0)
     assert not decision.is_push
-    feasible = np.asarray(decision.feasible)
+    feasible = np.asarray(decision.candidates.feasible)
     np.testing.assert_allclose(decision.values[feasible], 0.9 * decision.value_now, rtol=1e-4)
     assert np.isneginf(decision.values[~feasible]).all()
 
 
 def test_gamma_and_threshold_are_values(seen: Observation) -> None:
     # with gamma above 1 even a push that changes nothing wins
-    decision = _decide(seen, static, covered, threshold=1.0, gamma=1.1)
+    decision = _decide(seen, static, covered, grasp_above=1.0, gamma=1.1)
     assert decision.is_push and decision.value_push > decision.value_now
 
 
 def test_a_push_that_clears_the_view_is_dropped_as_out_of_the_workspace(seen: Observation) -> None:
-    decision = _decide(seen, away, bare, threshold=1.0)
-    assert not decision.is_push and not decision.feasible.any()
+    decision = _decide(seen, away, bare, grasp_above=1.0)
+    assert not decision.is_push and not decision.candidates.feasible.any()
 
 
 def test_the_push_that_raises_the_mean_most_is_chosen(seen: Observation) -> None:
-    decision = _decide(seen, stack_for_the_third, bare_squared, threshold=2.0)
-    assert decision.feasible[2] and decision.best == 2 and decision.is_push
-    np.testing.assert_array_equal(decision.push.start, decision.pushes.start[2])
+    decision = _decide(seen, stack_for_the_third, bare_squared, grasp_above=2.0)
+    assert decision.candidates.feasible[2] and decision.best == 2 and decision.is_push
+    np.testing.assert_array_equal(decision.push.start, decision.candidates.pushes.start[2])
     now, after = (np.asarray(bare_squared(image[None])).mean() for image in (render.rgbd(seen), decision.predicted))
     np.testing.assert_allclose([decision.value_now, decision.value_push], [now, 0.9 * after], rtol=1e-4)
-    assert not _decide(seen, stack_for_the_third, bare_squared, threshold=2.0, gamma=0.1).is_push
+    assert not _decide(seen, stack_for_the_third, bare_squared, grasp_above=2.0, gamma=0.1).is_push
 
 
 def test_trans_moves_only_the_pushed_object_by_the_push_length(seen: Observation) -> None:
-    decision = _decide(seen, static, covered, threshold=1.0)
-    motion = np.asarray(policy.trans_predictor(SLOTS)(seen, decision.pushes))
+    decision = _decide(seen, static, covered, grasp_above=1.0)
+    motion = np.asarray(predictors.trans_predictor(seen, decision.candidates.pushes))
     length = np.linalg.norm(motion[..., :2], axis=-1)
-    feasible = np.asarray(decision.feasible)
+    feasible = np.asarray(decision.candidates.feasible)
     assert ((length > 0).sum(-1)[feasible] == 1).all()
     np.testing.assert_allclose(length.max(-1)[feasible], 0.1, rtol=1e-5)
 
 
 def test_clauses_of_the_released_code(seen: Observation) -> None:
-    tempting = {"threshold": 2.0, "gamma": 1.1}
+    tempting = {"grasp_above": 2.0, "gamma": 1.1}
     assert _decide(seen, static, covered, **tempting).is_push
-    assert not _decide(seen, static, covered, better=True, **tempting).is_push, "the best score does not rise"
-    # gamma counts only where the best score after the push is over `sure`
-    assert not _decide(seen, static, covered, sure=1.0, **tempting).is_push
+    assert not _decide(seen, static, covered, push_must_raise_best=True, **tempting).is_push, (
+        "the best score does not rise"
+    )
+    # gamma counts only where the best score after the push is over `discount_above`
+    assert not _decide(seen, static, covered, discount_above=1.0, **tempting).is_push
     one = seen.replace(label=jnp.where(seen.label == 0, 0, -1), height=jnp.where(seen.label == 0, seen.height, 0.0))
     assert _decide(one, static, covered, **tempting).is_push
-    assert not _decide(one, static, covered, several=True, **tempting).is_push, "a lone object is grasped"
-    assert (planner.RELEASED.reach, planner.RELEASED.several, planner.RELEASED.better) == (2.0, True, True)
+    assert not _decide(one, static, covered, grasp_lone=True, **tempting).is_push, "a lone object is grasped"
+    released = planner.RELEASED
+    assert (released.edge_factor, released.grasp_lone, released.push_must_raise_best) == (2.0, True, True)
 
 
 def test_a_predicted_motion_counts_as_far_as_it_is_executed(seen: Observation) -> None:
     def some(observation: Observation, pushes: Push) -> jax.Array:
         return static(observation, pushes).at[..., 0].set(0.06)
 
-    near = _decide(seen, some, covered, threshold=2.0).feasible
-    far = _decide(seen, some, covered, threshold=2.0, reach=4.0).feasible
+    near = _decide(seen, some, covered, grasp_above=2.0).candidates.feasible
+    far = _decide(seen, some, covered, grasp_above=2.0, edge_factor=4.0).candidates.feasible
     assert near.any() and not far.any()
 
 
@@ -126,11 +128,10 @@ def test_the_better_of_two_values_is_done(seen: Observation) -> None:
     def valued(value: float) -> Any:
         return lambda images: jnp.full((images.shape[0], 16, 224, 224), value).at[:, 2, 112, 30].add(0.1)
 
-    options = {"slots": SLOTS, "distance": 0.1}
-    decision = planner.compare(seen, valued(0.7), valued(0.5), **options)
+    decision = planner.decide_by_value(seen, valued(0.7), valued(0.5), distance=0.1)
     assert decision.is_push and decision.push.distance == np.float32(0.1)
     possible = fingers.pushable(seen.height)
     assert possible[tuple(candidates.push_index(decision.push))]
-    assert not planner.compare(seen, valued(0.7), valued(0.5), threshold=0.4, **options).is_push
-    assert not planner.compare(seen, valued(0.4), valued(0.5), **options).is_push
+    assert not planner.decide_by_value(seen, valued(0.7), valued(0.5), grasp_above=0.4, distance=0.1).is_push
+    assert not planner.decide_by_value(seen, valued(0.4), valued(0.5), distance=0.1).is_push
     assert decision.grasp_pixel.tolist() == [2, 112, 30]

@@ -9,7 +9,7 @@ from flax import nnx
 from dipn_jax.errors import UserError
 from dipn_jax.networks import vpg
 from dipn_jax.networks.vpg import VpgConfig
-from dipn_jax.planning import policy
+from dipn_jax.planning import scorers
 from dipn_jax.storage import checkpoint
 
 
@@ -34,7 +34,7 @@ def test_the_published_form_has_two_trunks_a_primitive_and_answers_every_pixel()
 def test_pushes_have_sixteen_directions_and_grasps_eight() -> None:
     model = checkpoint.build("vpg", VpgConfig(width=8, coarse=8))
     model.eval()
-    pushes, grasps = policy.value_scorers(model)  # type: ignore[arg-type]
+    pushes, grasps = scorers.value_scorers(model)  # type: ignore[arg-type]
     image = jnp.zeros((1, 224, 224, 4)).at[:, 90:130, 60:120, 3].set(0.05)
     push, grasp = np.asarray(pushes(image))[0], np.asarray(grasps(image))[0]
     assert push.shape == grasp.shape == (16, 224, 224)
@@ -46,7 +46,7 @@ def test_pushes_have_sixteen_directions_and_grasps_eight() -> None:
 
 def test_a_part_that_was_not_learnt_is_none_and_nonsense_is_refused() -> None:
     model = checkpoint.build("vpg", VpgConfig(parts=("grasp",), answers="chance", width=8, coarse=8))
-    pushes, grasps = policy.value_scorers(model)  # type: ignore[arg-type]
+    pushes, grasps = scorers.value_scorers(model)  # type: ignore[arg-type]
     assert pushes is None and grasps is not None
     for wrong in ({"preset": "huge"}, {"parts": ("place",)}, {"answers": "maybe"}):
         with pytest.raises(UserError, match="VPG network"):

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from dipn_jax.eval import metrics
-from dipn_jax.eval.clearing import command, instances, lockstep, methods, sweeping
+from dipn_jax.eval.clearing import command, instances, lockstep, on_tables, sweeping
 from dipn_jax.eval.clearing.instances import Instance, Tables
 from flax import nnx
 
@@ -17,7 +17,8 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
-from dipn_jax.planning import planner
+from dipn_jax.planning import planner, predictors
+from dipn_jax.planning.methods import Networks, PolicyConfig
 from dipn_jax.storage import checkpoint
 from dipn_jax.world import cases, scenes
 
@@ -40,19 +41,23 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
     return {name: folder / name for name in CONFIGS}
 
 
-def _nets(runs: dict[str, pathlib.Path]) -> methods.Nets:
-    return methods.Nets(runs["push"], runs["grasp"], runs["value"])
+def _networks(runs: dict[str, pathlib.Path]) -> Networks:
+    return Networks(runs["push"], runs["grasp"], runs["value"])
+
+
+def _load(method: str, networks: Networks, engine: Any, **config: Any) -> Any:
+    return on_tables.load(method, networks, engine, [PolicyConfig(**config)])[0]
 
 
 @pytest.mark.parametrize("method", ["rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"])
 def test_every_method_decides_on_every_table_by_itself(
     method: Any, engine: Any, settled: Any, runs: dict[str, pathlib.Path]
 ) -> None:
-    plan = methods.Plan(method, candidates=3, threshold=0.9, gamma=1.2)
-    nets = _nets(runs)
+    config = {"candidates": 3, "grasp_above": 0.9, "gamma": 1.2}
+    networks = _networks(runs)
     if method == "rea+dipn":
-        nets = dataclasses.replace(nets, value=runs["chances"])
-    decide = methods.load(plan, nets, engine, slots=5)
+        networks = dataclasses.replace(networks, value=runs["chances"])
+    decide = _load(method, networks, engine, **config)
     keys = jax.random.split(jax.random.key(0), 3)
     scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]
     none = np.tile(planner.NONE_MISSED, (3, 4, 1))
@@ -62,13 +67,11 @@ def test_every_method_decides_on_every_table_by_itself(
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a[1:2], b, atol=1e-6), together, alone)
     missed = np.concatenate([none[:, 1:], together.grasp_pixel[:, None]], 1)
     doubting = decide(keys, scene, poses, missed)
-    assert (doubting.values[:, 0] < together.values[:, 0]).all() and (doubting.grasp_pixel != missed[:, -1]).any()
+    assert (doubting.grasp_score < together.grasp_score).all() and (doubting.grasp_pixel != missed[:, -1]).any()
     if method == "gn":
         assert not together.is_push.any()
-        forgetful = methods.load(dataclasses.replace(plan, remember=False), nets, engine, slots=5)
-        np.testing.assert_array_equal(forgetful(keys, scene, poses, missed).grasp_pixel, together.grasp_pixel)
-        rash = methods.load(dataclasses.replace(plan, cautious=False), nets, engine, slots=5)
-        assert (rash(keys, scene, poses, none).values[:, 0] > together.values[:, 0]).all()
+        rash = _load(method, networks, engine, cautious=False)
+        assert (rash(keys, scene, poses, none).grasp_score > together.grasp_score).all()
     if method == "physics+gn":
         assert np.abs(together.motion).max() > 0.01, "the engine was not asked, or moved nothing"
 
@@ -84,7 +87,7 @@ def test_a_miss_is_kept_in_mind_until_something_near_it_moves(settled: Any) -> N
         made.poses = made.poses.copy()
         made.poses[moved[0], 0] += moved[1]
         made.did.append(did)
-        lockstep._doubt(made, before, np.array(pixel, np.int32))
+        lockstep._update_missed(made, before, np.array(pixel, np.int32))
         return int((lockstep._missed(made)[:, 0] >= 0).sum())
 
     assert act("grasp missed", (3, 112, 112)) == 1
@@ -93,27 +96,27 @@ def test_a_miss_is_kept_in_mind_until_something_near_it_moves(settled: Any) -> N
     assert act("grasp held", moved=(1, 0.006)) == 1
     np.testing.assert_array_equal(lockstep._missed(made)[0], [3, 112, 112])
     assert act("grasp missed", (5, 112, 112), moved=(0, 0.02)) == 0, "it moved what it missed"
-    assert [act("grasp missed", (i, 112, 112)) for i in range(10)][-1] == lockstep.MISSES
+    assert [act("grasp missed", (i, 112, 112)) for i in range(10)][-1] == lockstep.REMEMBERED_MISSES
 
 
 def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pathlib.Path]) -> None:
     for method, net in (("dipn+gn", "push"), ("vpg", "value"), ("physics+gn", "grasp")):
         with pytest.raises(UserError, match=f"--method {method.replace('+', '.')}: wants --{net}-net"):
-            methods.load(methods.Plan(method), methods.Nets(), engine, slots=5)  # type: ignore[arg-type]
-    grasps_only = methods.Nets(None, runs["grasp"], runs["only"])
+            _load(method, Networks(), engine)
+    grasps_only = Networks(None, runs["grasp"], runs["only"])
     with pytest.raises(UserError, match="has not learnt to push"):
-        methods.load(methods.Plan("dqn+gn"), grasps_only, engine, slots=5)
+        _load("dqn+gn", grasps_only, engine)
     with pytest.raises(UserError, match="has learnt values, not chances"):
-        methods.load(methods.Plan("rea+dipn"), _nets(runs), engine, slots=5)
+        _load("rea+dipn", _networks(runs), engine)
     with pytest.raises(UserError, match="holds a grasp network, want vpg"):
-        methods.load(methods.Plan("vpg"), methods.Nets(value=runs["grasp"]), engine, slots=5)
+        _load("vpg", Networks(value=runs["grasp"]), engine)
     with pytest.raises(UserError, match="--method search"):
-        methods.Plan("search")  # type: ignore[arg-type]
+        _load("search", Networks(), engine)
 
 
 def test_of_several_distances_candidates_take_one_each() -> None:
-    plan = methods.Plan(candidates=5, distances=(0.03, 0.06))
-    np.testing.assert_allclose(plan.spread(), [0.03, 0.06, 0.03, 0.06, 0.03])
+    config = PolicyConfig(candidates=5, distances=(0.03, 0.06))
+    np.testing.assert_allclose(config.spread(), [0.03, 0.06, 0.03, 0.06, 0.03])
 
 
 def test_tables_are_a_case_file_or_random() -> None:
@@ -181,11 +184,9 @@ def test_a_sweep_goes_on_at_the_distance_where_it_was_stopped(
 
 
 def test_a_longer_push_is_harder_to_foresee(engine: Any) -> None:
-    from dipn_jax.planning import policy
-
     config = scenes.fixed_count(3, spread=0.2)
     values = sweeping.prediction_errors(
-        policy.static_predictor(3), engine, config, (0.03, 0.12), scenes=6, seed=0, longest=0.12
+        predictors.static_predictor, engine, config, (0.03, 0.12), scenes=6, seed=0, longest=0.12
     )
     near, far = (values[f"sweep/{name}/push_error/all"] for name in ("0.03", "0.12"))
     assert 0 <= near < far <= 1

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from dipn_jax.eval import metrics
-from dipn_jax.eval.clearing import film, instances, lockstep, methods
+from dipn_jax.eval.clearing import film, instances, lockstep, on_tables
 from dipn_jax.eval.grasping import success
 from dipn_jax.eval.prediction import push_errors
 from dipn_jax.eval.report import comparison, page
@@ -19,7 +19,8 @@ from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.planning import candidates, policy
+from dipn_jax.planning import candidates, predictors, scorers
+from dipn_jax.planning.methods import Networks, PolicyConfig
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint
 from dipn_jax.storage.resume import Partial
@@ -118,7 +119,7 @@ def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> N
     after = push_errors._labels_after(settled.scene, truth)
     pushes = Push(np.zeros((6, 2), np.float32), np.zeros(6, np.float32), np.full(6, 0.05, np.float32))
     rows: push_errors.Rows = {}
-    static = {"static": push_errors._at_distances(policy.static_predictor(5))}
+    static = {"static": push_errors._at_distances(predictors.static_predictor)}
     push_errors.measure(rows, "", static, seen, seen, pushes, truth, after, None)
     for b in range(6):
         for i in range(5):
@@ -132,7 +133,7 @@ def test_static_is_the_difference_of_two_renders(engine: Any, settled: Any) -> N
 def test_grasp_evaluation_writes_what_it_promises(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
-    scorer = policy.load_scorer(runs["grasp"])
+    scorer = scorers.load_scorer(runs["grasp"])
     values, tables = success.evaluate(scorer, engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3, others=2)
     assert values["attempts"] == sum(table.grasps for table in tables) >= 3 and values["scenes"] == 3
     assert sum(value for key, value in values.items() if key.startswith("table/")) == 3
@@ -151,15 +152,18 @@ def test_labels_of_pretraining_mostly_say_what_physics_says(engine: Any) -> None
 def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Two hard cases acted on by networks that know nothing: one by grasps, one by pushes."""
     out = tmp_path_factory.mktemp("clear")
-    nets = methods.Nets(push=runs["dipn"], grasp=runs["grasp"])
+    networks = Networks(push=runs["dipn"], grasp=runs["grasp"])
 
     def table(name: str) -> list[instances.Instance]:
         return instances.hard_instances(engine, cases.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
 
-    grasps = methods.load(methods.Plan(candidates=4, threshold=0.0), nets, engine, slots=6)
+    def load(**config: Any) -> on_tables.TablePolicy:
+        return on_tables.load("dipn+gn", networks, engine, [PolicyConfig(candidates=4, **config)])[0]
+
+    grasps = load(grasp_above=0.0)
     grasped = lockstep.clear(table("06"), engine, grasps, Partial(out, {"case": "06"}), seed=0)
     tables = table("10")
-    decide = methods.load(methods.Plan(candidates=4, threshold=2.0, gamma=1.05), nets, engine, slots=6)
+    decide = load(grasp_above=2.0, gamma=1.05)
     # interrupted after the second turn, then taken up by a fresh call
     partial = Partial(out, {})
     save = partial.save

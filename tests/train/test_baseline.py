@@ -12,7 +12,7 @@ from dipn_jax.train.acting import Look
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
-from dipn_jax.planning import policy
+from dipn_jax.planning import scorers
 from dipn_jax.storage import checkpoint, resume
 from dipn_jax.structs import Grasp, Push
 from dipn_jax.world import scenes
@@ -112,7 +112,7 @@ def test_a_run_that_was_interrupted_goes_on_to_the_same_end(
     assert baseline.learn(engine, CONFIG, config, tmp_path / "b", **gn) == whole
     there, here = (checkpoint.load_network(tmp_path / name, network="vpg") for name in "ab")
     assert checkpoint.digest(there) == checkpoint.digest(here)
-    pushes, grasps = policy.load_values(tmp_path / "a")
+    pushes, grasps = scorers.load_values(tmp_path / "a")
     assert (pushes is None) == (method == "rea") and (grasps is None) == (method == "dqn")
     with pytest.raises(UserError, match="takes a --grasp-net" if gn else "takes no --grasp-net"):
         baseline.learn(engine, CONFIG, config, tmp_path / "c", **({} if gn else {"scorer": grasps}))

@@ -1,0 +1,269 @@
+"""The methods that clear tables: one registry of what each needs and how it is built. `load_policy` builds one.
+
+A new method is one entry of `METHODS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Callable
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dipn_jax.errors import UserError
+from dipn_jax.networks import vpg
+from dipn_jax.planning import planner, predictors, scorers
+from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
+from dipn_jax.storage import checkpoint
+from dipn_jax.structs import Array, Decision, Observation
+
+MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
+NetworkRole = Literal["push", "grasp", "value"]
+ROLES: dict[NetworkRole, tuple[str, str]] = {
+    "push": ("dipn", "push"),
+    "grasp": ("grasp", "grasp"),
+    "value": ("vpg", "baseline"),
+}
+"""What a network does in a method -> its name in checkpoints, and the dipn-train command that makes it."""
+LONGEST_PUSH = 0.12
+"""Metres."""
+
+Act = Callable[[jax.Array, Observation, Array, Rule, Array], Decision]
+"""(key, observation, grasps that missed [M, 3], rule, distances of the candidates [P] metres) -> decision."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A method that is ready to decide: observation in, decision out.
+
+    `act` is compiled once; policies that differ in rule or distances only share it (`with_config`).
+    """
+
+    act: Act
+    rule: Rule
+    distances: np.ndarray  # [P] metres, of the candidates
+
+    def __call__(self, key: jax.Array, observation: Observation, *, missed: Array = planner.NONE_MISSED) -> Decision:
+        """Decide on one table.
+
+        Args:
+          key: random key, for the candidates.
+          observation: what the camera sees.
+          missed: `[M, 3]` int32 grasps (rotation, row, col) that missed on this table as it is.
+        """
+        return self.act(key, observation, missed, self.rule, self.distances)
+
+    def with_config(self, config: PolicyConfig) -> Policy:
+        """The same networks with another rule and other distances; as many candidates as before."""
+        return dataclasses.replace(self, rule=config.rule(), distances=config.spread())
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyConfig:
+    """How a method decides, apart from its networks."""
+
+    candidates: int = 32  # pushes considered at a time
+    distances: tuple[float, ...] = (0.10,)  # metres a push goes; of several, candidates take them in turn
+    gamma: float = 0.9
+    grasp_above: float = 0.7
+    released: bool = False  # with the clauses of DIPN's released code
+    cautious: bool = True  # GN's scores are the least of four answers; False: GN as published
+
+    def rule(self) -> Rule:
+        """What the planner compares by."""
+        rule = planner.RELEASED if self.released else Rule()
+        result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above)
+        return result
+
+    def spread(self) -> np.ndarray:
+        """The distance of each candidate `[P]`, metres."""
+        return np.resize(np.asarray(self.distances, np.float32), self.candidates)
+
+
+Runs = dict[str, pathlib.Path]
+"""Role -> folder of a run."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """What a method is."""
+
+    networks: tuple[NetworkRole, ...]  # that it decides with
+    build: Callable[[Runs, PolicyConfig], Policy] | None  # None: it decides on the simulator's state, not on images
+    about: str
+    pushes: bool = True  # whether it ever pushes
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """Runs that a method decides with, by role."""
+
+    push: pathlib.Path | None = None  # dipn-train push
+    grasp: pathlib.Path | None = None  # dipn-train grasp
+    value: pathlib.Path | None = None  # dipn-train baseline
+
+    def runs(self, method: str) -> Runs:
+        """The runs that `method` needs.
+
+        Raises:
+          UserError: no such method, or one of its networks was not given.
+        """
+        needed = find(method).networks
+        for role in needed:
+            if getattr(self, role) is None:
+                raise UserError(f"--method {method}: wants --{role}-net; give a run of dipn-train {ROLES[role][1]}")
+        return {role: checkpoint.find(getattr(self, role), network=ROLES[role][0]) for role in needed}
+
+
+def find(name: str) -> Method:
+    """The method called `name`.
+
+    Raises:
+      UserError: there is none.
+    """
+    if name not in METHODS:
+        raise UserError(f"--method {name}: want one of {', '.join(get_args(MethodName))}")
+    return METHODS[name]
+
+
+def load_policy(
+    method: MethodName = "dipn+gn",
+    *,
+    push_net: pathlib.Path | str | None = "builtin",
+    grasp_net: pathlib.Path | str | None = "builtin",
+    value_net: pathlib.Path | str | None = None,
+    config: PolicyConfig = PolicyConfig(),
+) -> Policy:
+    """Load the policy of a method, with the networks that come with the package or with your own.
+
+        policy = dipn_jax.load_policy("dipn+gn", push_net="runs/dipn")
+        decision = policy(jax.random.key(0), observation)
+
+    Args:
+      method: a name of `METHODS`.
+      push_net: run of `dipn-train push`, or `builtin`.
+      grasp_net: run of `dipn-train grasp`, or `builtin`.
+      value_net: run of `dipn-train baseline`; only the compared methods rea+dipn, dqn+gn and vpg need one.
+      config: how it decides.
+
+    Raises:
+      UserError: no such method, a network that it needs was not given or is another, or it decides on the simulator's
+        state (`physics+gn`).
+    """
+    paths = (None if run is None else pathlib.Path(run) for run in (push_net, grasp_net, value_net))
+    build = find(method).build
+    if build is None:
+        raise UserError(f"--method {method}: decides on the simulator's state, not on an image; run dipn-eval clear")
+    return build(Networks(*paths).runs(method), config)
+
+
+def grasping_policy(scorer: Scorer) -> Policy:
+    """The policy that grasps where `scorer` scores highest, and never pushes."""
+    act = imagining(predictors.static_predictor, scorer, None)
+    return Policy(act, Rule(grasp_above=-1.0), np.array([0.1], np.float32))
+
+
+def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSummary | None) -> Act:
+    """Alg. 2: imagine the image after every candidate push."""
+
+    def act(key: jax.Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
+        count = len(distances)
+        return planner.decide(
+            key, seen, predictor, scorer, count=count, distance=distances, rule=rule, summarize=summarize, missed=missed
+        )
+
+    return act
+
+
+def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Act:
+    """The better of the best push and the best grasp by their values; all pushes go the first distance.
+
+    Args:
+      push_scorer: values of pushes.
+      scorer: values of grasps.
+      grasp_at_once: whether the rule's `grasp_above` holds.
+    """
+
+    def act(_: jax.Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
+        above = rule.grasp_above if grasp_at_once else jnp.inf
+        return planner.decide_by_value(
+            seen, push_scorer, scorer, distance=distances[0], grasp_above=above, missed=missed
+        )
+
+    return act
+
+
+def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSummary]:
+    """The scorer that GN's grasps are chosen by, and the summary that images are compared by.
+
+    The clauses of the released code look at the highest score on every image, which only whole images tell.
+    """
+    return scorers.load_scorer(run, cautious=config.cautious), scorers.load_summary(run, whole=config.released)
+
+
+def _dipn_gn(runs: Runs, config: PolicyConfig) -> Policy:
+    act = imagining(predictors.load_predictor(runs["push"]), *gn_scores(runs["grasp"], config))
+    return Policy(act, config.rule(), config.spread())
+
+
+def _rea_dipn(runs: Runs, config: PolicyConfig) -> Policy:
+    summary = scorers.load_summary(runs["value"], network="vpg", whole=config.released)
+    act = imagining(predictors.load_predictor(runs["push"]), _chances(runs["value"]), summary)
+    return Policy(act, config.rule(), config.spread())
+
+
+def _dqn_gn(runs: Runs, config: PolicyConfig) -> Policy:
+    scorer = scorers.load_scorer(runs["grasp"], cautious=config.cautious)
+    act = comparing(_part(runs["value"], "push"), scorer, grasp_at_once=True)
+    return Policy(act, config.rule(), config.spread())
+
+
+def _vpg(runs: Runs, config: PolicyConfig) -> Policy:
+    act = comparing(_part(runs["value"], "push"), _part(runs["value"], "grasp"), grasp_at_once=False)
+    return Policy(act, config.rule(), config.spread())
+
+
+def _gn(runs: Runs, config: PolicyConfig) -> Policy:
+    return grasping_policy(scorers.load_scorer(runs["grasp"], cautious=config.cautious))
+
+
+def _chances(run: pathlib.Path) -> Scorer:
+    """The scorer of the grasps of REA.
+
+    Raises:
+      UserError: the run answers with values, of which neither a mean nor the threshold 0.7 has a meaning.
+    """
+    model: Any = checkpoint.load_network(run, network="vpg")
+    if model.config.answers != "chance":
+        raise UserError(
+            f"--value-net {run}: has learnt values, not chances; give a run of dipn-train baseline --method rea"
+        )
+    return _part(run, "grasp")
+
+
+def _part(run: pathlib.Path, name: str) -> Scorer:
+    """The scorer of pushes or of grasps of a baseline.
+
+    Raises:
+      UserError: it was trained without.
+    """
+    found = scorers.load_values(run)[vpg.PARTS.index(name)]
+    if found is None:
+        raise UserError(
+            f"--value-net {run}: has not learnt to {name}; give a run of another dipn-train baseline --method"
+        )
+    return found
+
+
+METHODS: dict[str, Method] = {
+    "dipn+gn": Method(("push", "grasp"), _dipn_gn, "imagine every push with DIPN, compare GN's mean scores"),
+    "rea+dipn": Method(("push", "value"), _rea_dipn, "the same with REA's grasp network in place of GN"),
+    "dqn+gn": Method(("value", "grasp"), _dqn_gn, "GN for grasps, Q-learning for pushes"),
+    "vpg": Method(("value",), _vpg, "two Q-functions, one of pushes and one of grasps"),
+    "gn": Method(("grasp",), _gn, "GN's best grasp, never a push", pushes=False),
+    "physics+gn": Method(("grasp",), None, "imagine every push with the engine itself: a privileged ceiling"),
+}

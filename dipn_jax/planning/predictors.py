@@ -1,0 +1,74 @@
+"""Where every object goes when it is pushed, as functions that the planner calls: the two baselines, and DIPN."""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from dipn_jax.networks import dipn, push_frame
+from dipn_jax.planning.planner import Predictor
+from dipn_jax.sight import imagine
+from dipn_jax.storage import checkpoint
+from dipn_jax.structs import ABSENT, Observation, Push
+
+
+def static_predictor(observation: Observation, pushes: Push) -> jax.Array:
+    """Baseline: nothing moves; a Predictor."""
+    return jnp.zeros((pushes.angle.shape[0], observation.slots, 3))
+
+
+def trans_predictor(observation: Observation, pushes: Push) -> jax.Array:
+    """Baseline: only the pushed object moves, by the push length along the push; a Predictor."""
+
+    def one(label: jax.Array, push: Push) -> jax.Array:
+        hit = imagine.move_toward(label, push.start, push.angle)
+        shift = push.distance * jnp.stack([jnp.cos(push.angle), jnp.sin(push.angle), jnp.zeros(())])
+        return jnp.where(((jnp.arange(observation.slots) == hit) & (hit != ABSENT))[:, None], shift, 0.0)
+
+    return jax.vmap(one, in_axes=(None, 0))(observation.label, pushes)
+
+
+def dipn_motions(model: dipn.DIPN, observation: Observation, pushes: Push, distances: jax.Array) -> jax.Array:
+    """Predict motions by pushes `[P]`, each on its own observation `[P, H, W]` or all on the same `[H, W]`.
+
+    Args:
+      model: in evaluation mode.
+      observation: its labels are the masks, from the simulator or found in the image.
+      pushes: `[P]`; their own distance is not looked at.
+      distances: `[P, K]` metres.
+
+    Returns:
+      `[P, K, N, 3]`: dx, dy (metres) of each mask's centroid, dtheta (radians), workspace.
+    """
+    slots, view = observation.slots, model.config.view
+    if observation.label.ndim == 2:
+        make = functools.partial(push_frame.push_input, slots=slots, view=view)
+        inputs, _ = jax.vmap(make, in_axes=(None, None, 0))(observation.label, observation.height, pushes)
+    else:
+        inputs, _ = push_frame.push_inputs(observation.label, observation.height, pushes, slots=slots, view=view)
+    motion = dipn.symmetric(model, inputs, distances)
+    return push_frame.to_workspace(motion.swapaxes(1, 2), pushes.angle[:, None])
+
+
+def dipn_predictor(model: dipn.DIPN) -> Predictor:
+    """DIPN as a predictor of each push's own distance."""
+    graph, state = nnx.split(model)
+
+    def predict(observation: Observation, pushes: Push) -> jax.Array:
+        network = nnx.merge(graph, state)
+        return dipn_motions(network, observation, pushes, pushes.distance[:, None])[:, 0]
+
+    return predict
+
+
+def load_predictor(run: pathlib.Path | str) -> Predictor:
+    """The predictor of a `dipn-train push` run, or `builtin`.
+
+    Raises:
+      UserError: as `checkpoint.load_network`.
+    """
+    return dipn_predictor(checkpoint.load_network(pathlib.Path(run), network="dipn"))  # type: ignore[arg-type]
