@@ -6,7 +6,7 @@ import tempfile
 
 import dipn_jax
 from dipn_jax.datagen import cli as datagen
-from dipn_jax.planning import policy
+from dipn_jax.planning import predictors
 from dipn_jax.train import cli as train
 
 folder = pathlib.Path(tempfile.mkdtemp())
@@ -21,6 +21,6 @@ for point in curve:
 
 episode = dipn_jax.read_episodes(folder / "data")[0]
 observation = dipn_jax.render(episode.scene, episode.poses[0])
-predict = policy.load_predictor(folder / "run", observation.slots)
+predict = predictors.load_predictor(folder / "run")
 motion = predict(observation, episode.push[None])
 print("predicted motion (m, m, rad) of each object:", motion[0].round(3))

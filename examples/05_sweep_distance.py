@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import dipn_jax
-from dipn_jax.planning import candidates, policy
+from dipn_jax.planning import candidates, predictors
 
 names, scenes, poses = dipn_jax.load_cases()
 observation = dipn_jax.render(scenes[1], poses[1])
-predict = policy.dipn_predictor(dipn_jax.load_network("dipn"), observation.slots)
+predict = predictors.load_predictor("builtin")
 pushes, feasible = candidates.sample_pushes(jax.random.key(0), observation, count=4, distance=0.1)
 push = pushes[0]
 

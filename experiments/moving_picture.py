@@ -15,7 +15,6 @@ from typing import Any
 
 import matplotlib
 
-import dipn_jax  # noqa: F401  settings that must be made before JAX is imported
 
 matplotlib.use("agg")
 import cv2
