@@ -4,9 +4,9 @@ import pathlib
 import tempfile
 
 import numpy as np
+from dipn_jax.datagen import cli as datagen
 
 import dipn_jax
-from dipn_jax.datagen import cli as datagen
 
 folder = pathlib.Path(tempfile.mkdtemp()) / "pushes"
 datagen.push(folder, episodes=8, objects="3", actions=4, shard_size=8)

@@ -4,10 +4,11 @@ import json
 import pathlib
 import tempfile
 
-import dipn_jax
 from dipn_jax.datagen import cli as datagen
-from dipn_jax.planning import predictors
 from dipn_jax.train import cli as train
+
+import dipn_jax
+from dipn_jax.planning import predictors
 
 folder = pathlib.Path(tempfile.mkdtemp())
 datagen.push(folder / "data", episodes=40, objects="3", actions=4, shard_size=40)

@@ -15,7 +15,6 @@ from typing import Any
 
 import matplotlib
 
-
 matplotlib.use("agg")
 import cv2
 import jax

@@ -1,4 +1,4 @@
-"""The pictures of docs/tutorial.md, made by running the Python of that page: `python -m experiments.tutorial_pictures`."""
+"""`python -m experiments.tutorial_pictures`: the pictures of docs/tutorial.md, made by running the Python of that page."""
 
 from __future__ import annotations
 
