@@ -1,3 +1,5 @@
 """What the project costs, as ratios of two things measured side by side: `python -m benchmarks`."""
 
-import dipn_jax  # noqa: F401  settings that must be made before JAX is imported
+import os
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as `console` sets it for the commands: JAX reads it on import

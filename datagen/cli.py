@@ -6,20 +6,19 @@ import dataclasses
 import json
 import pathlib
 import sys
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from dipn_jax import console
 from dipn_jax.engine import EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.planning import scorers
-from dipn_jax.planning.planner import Scorer
-from dipn_jax.storage import checkpoint, records
-from dipn_jax.world import scenes
+from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
-from . import check
-from .generate import Job, generate
+if TYPE_CHECKING:
+    from dipn_jax.planning.planner import Scorer
+
+    from .generate import Job
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
 
@@ -41,18 +40,10 @@ class Work:
 DEFAULT_WORK = Work()
 
 
-def _generate(
-    kind: str,
-    out: pathlib.Path,
-    objects: str,
-    ranges: scenes.Ranges,
-    work: Work,
-    scorer: Scorer | None = None,
-    **job: Any,
-) -> None:
-    scene = scenes.parse_objects(objects, ranges=ranges)
-    made = Job(kind, scene, engine=work.engine, timestep=work.timestep, **job)
-    generate(made, out, part=work.shard, of=work.of, scorer=scorer)
+def _generate(job: Job, out: pathlib.Path, work: Work, *, scorer: Scorer | None = None) -> None:
+    from .generate import generate
+
+    generate(job, out, part=work.shard, of=work.of, scorer=scorer)
 
 
 def push(
@@ -63,12 +54,12 @@ def push(
     actions: int = 3,
     distances: tuple[float, ...] = (0.10,),
     shard_size: int = 500,
-    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
+    ranges: Ranges = DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
     """Push episodes: a settled scene, one 10 cm push, poses at every centimetre.
 
-    1,500 episodes take about two minutes on two cores:
+    About two minutes on two cores for 1,500 episodes:
       dipn-datagen push --out data/push --episodes 1500
 
     The same pushes at three distances, each ended by its own retreat:
@@ -85,9 +76,22 @@ def push(
       ranges: what random objects are drawn from.
       work: engine and share of the work.
     """
-    job: dict[str, Any] = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions}
-    job["distances"] = distances
-    _generate("push", out, objects, ranges, work, **job)
+    from dipn_jax.world import scenes
+
+    from .generate import Job
+
+    job = Job(
+        "push",
+        scenes.parse_objects(objects, ranges=ranges),
+        episodes=episodes,
+        seed=seed,
+        shard_size=shard_size,
+        actions=actions,
+        distances=distances,
+        engine=work.engine,
+        timestep=work.timestep,
+    )
+    _generate(job, out, work)
 
 
 def grasp(
@@ -100,7 +104,7 @@ def grasp(
     grasp_net: pathlib.Path | None = None,
     guided: float | None = None,
     hard: float | None = None,
-    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
+    ranges: Ranges = DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
     """Grasp episodes: a settled scene, one grasp, held or not.
@@ -124,17 +128,41 @@ def grasp(
       ranges: what random objects are drawn from.
       work: engine and share of the work.
     """
-    job: dict[str, Any] = {"episodes": episodes, "seed": seed, "shard_size": shard_size, "actions": actions}
+    if grasp_net is None and (guided is not None or hard is not None):
+        raise UserError("--guided and --hard are shares of what a network believes: give --grasp-net, too")
+    from dipn_jax.world import scenes
+
+    from .generate import Job
+
+    job = Job(
+        "grasp",
+        scenes.parse_objects(objects, ranges=ranges),
+        episodes=episodes,
+        seed=seed,
+        shard_size=shard_size,
+        actions=actions,
+        engine=work.engine,
+        timestep=work.timestep,
+    )
     if grasp_net is None:
-        if guided is not None or hard is not None:
-            raise UserError("--guided and --hard are shares of what a network believes: give --grasp-net, too")
-        return _generate("grasp", out, objects, ranges, work, **job)
-    guided, hard = (value if given is None else given for given, value in ((guided, 0.5), (hard, 0.25)))
+        _generate(job, out, work)
+    else:
+        guided, hard = (value if given is None else given for given, value in ((guided, 0.5), (hard, 0.25)))
+        _generate_guided(job, out, work, grasp_net, guided=guided, hard=hard)
+
+
+def _generate_guided(
+    job: Job, out: pathlib.Path, work: Work, grasp_net: pathlib.Path, *, guided: float, hard: float
+) -> None:
+    """Generate grasps of which a network chooses the shares `guided` and `hard`."""
+    from dipn_jax.planning import scorers
+    from dipn_jax.storage import checkpoint
+
     if not (guided >= 0 and hard >= 0 and 0 < guided + hard <= 1):
         raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
     network: Any = checkpoint.load_network(grasp_net, network="grasp")
-    job |= {"guided": guided, "hard": hard, "weights": checkpoint.digest(network)}
-    _generate("grasp", out, objects, ranges, work, scorer=scorers.cautious_scorer(network), **job)
+    job = dataclasses.replace(job, guided=guided, hard=hard, weights=checkpoint.digest(network))
+    _generate(job, out, work, scorer=scorers.cautious_scorer(network))
 
 
 def images(
@@ -143,7 +171,7 @@ def images(
     objects: Objects = "10",
     seed: int = 0,
     shard_size: int = 100,
-    ranges: scenes.Ranges = scenes.DEFAULT_RANGES,
+    ranges: Ranges = DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
     """Settled scenes without an action, for GN's pre-training on images.
@@ -159,7 +187,21 @@ def images(
       ranges: what random objects are drawn from.
       work: engine and share of the work.
     """
-    _generate("images", out, objects, ranges, work, episodes=episodes, seed=seed, shard_size=shard_size, actions=1)
+    from dipn_jax.world import scenes
+
+    from .generate import Job
+
+    job = Job(
+        "images",
+        scenes.parse_objects(objects, ranges=ranges),
+        episodes=episodes,
+        seed=seed,
+        shard_size=shard_size,
+        actions=1,
+        engine=work.engine,
+        timestep=work.timestep,
+    )
+    _generate(job, out, work)
 
 
 def check_world(
@@ -176,14 +218,16 @@ def check_world(
       dipn-datagen check-world --out results/world
 
     Args:
-      out: folder for metrics.json and world.md; asking again goes on where it stopped.
+      out: folder for metrics.json and world.md; asking again continues where it stopped.
       engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
       scenes_: scenes with a push and a grasp each.
-      few: as many of them for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, warp).
+      few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
       tries: grasps of every catalogue item.
       seed: seed of everything random.
     """
-    check.run(out, check.Plan(engines, scenes_, few, tries, seed))
+    from . import check
+
+    check.run(out, check.Plan(engines, scenes=scenes_, few=few, tries=tries, seed=seed))
 
 
 def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
@@ -192,6 +236,8 @@ def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     Args:
       folder: a data set.
     """
+    from dipn_jax.storage import records
+
     problems = records.verify(folder)
     if problems:
         path, what = problems[0]
@@ -205,6 +251,8 @@ def repair(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     Args:
       folder: a data set.
     """
+    from dipn_jax.storage import records
+
     removed = records.repair(folder)
     console.say(
         f"{folder}: {len(removed)} damaged shards set aside {[p.name for p in removed]}; generate again to fill"
@@ -217,6 +265,8 @@ def info(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     Args:
       folder: a data set.
     """
+    from dipn_jax.storage import records
+
     console.say(json.dumps(records.summary(folder), indent=1))
 
 

@@ -1,10 +1,12 @@
-"""What the three commands share with a terminal: progress, one-line errors, the compilation cache.
+"""What the three commands share with a terminal: progress, help, one-line errors, the compilation cache.
 
-The only module of the library that prints, and with `records` and `checkpoint` the only ones that know folders.
+The only module of the library that prints. Importing it imports no JAX, so that `--help` answers at once.
 """
 
 from __future__ import annotations
 
+import inspect
+import itertools
 import math
 import os
 import pathlib
@@ -12,26 +14,37 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
-import jax
-import rich.progress
 import tyro
 
 from dipn_jax.errors import UserError
+
+if TYPE_CHECKING:
+    import rich.progress
 
 LOG_PERIOD = 10.0
 """Seconds between progress lines where there is no terminal."""
 
 
 def enable_compilation_cache() -> None:
-    """Keep compiled programs in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`)."""
+    """Keep compiled programs in the user's cache folder (`XDG_CACHE_HOME`, else `~/.cache`).
+
+    Where JAX has not been imported yet, environment variables tell it, so that this does not import it.
+    """
+    # on some processors XLA logs an error for every program that it finds in the cache, though it runs them (openxla
+    # issue 44565); it reads this variable when JAX is first imported
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     home = os.environ.get("XDG_CACHE_HOME") or str(pathlib.Path.home() / ".cache")
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(pathlib.Path(home) / "dipn-jax" / "xla")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.5}
+    for name, value in settings.items():
+        if "jax" in sys.modules:
+            sys.modules["jax"].config.update(name, value)
+        else:
+            os.environ[name.upper()] = str(value)
 
 
 class Progress:
@@ -43,6 +56,8 @@ class Progress:
         self.note = ""
         self._bar: rich.progress.Progress | None = None
         if sys.stderr.isatty():
+            import rich.progress
+
             self._bar = rich.progress.Progress(
                 rich.progress.TextColumn("{task.description}"),
                 rich.progress.BarColumn(),
@@ -155,24 +170,52 @@ class Interruption:
         self.__exit__()
 
 
+def _described(command: Callable[..., Any], *, whole: bool) -> str:
+    """The text of a command's help: the first sentence of its docstring, or everything before `Args:`.
+
+    Tyro joins a line that begins with a letter to the line before. So every paragraph becomes one line here and is set
+    apart by a blank line; indented lines, which are examples to be copied, stay as they are below their paragraph.
+    """
+    text = inspect.cleandoc(command.__doc__ or "").split("\nArgs:")[0]
+    first, *rest = text.strip().split("\n\n")
+    result = " ".join(first.split())
+    for paragraph in rest if whole else []:
+        for is_example, group in itertools.groupby(paragraph.splitlines(), lambda line: line.startswith(" ")):
+            lines = list(group)
+            result += "\n" + "\n".join(lines) if is_example else "\n\n" + " ".join(lines)
+    return result
+
+
 def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | None = None) -> int:
-    """Parse and run one of `commands`.
+    """Parse the command line and call one of `commands`.
+
+    Args:
+      description: what the commands are for.
+      commands: functions by the name that a user types; their docstrings are the help texts.
+      arguments: the command line; that of this process if not given.
 
     Returns:
-      The exit code: 0, or 2 after one line on standard error for a mistake of the user's; 130 when interrupted
-      (what was written before stays valid, and the same command goes on from there).
+      The exit code, as `exit_code`.
     """
     enable_compilation_cache()
+    return exit_code(lambda: _parse_and_call(description, commands, sys.argv[1:] if arguments is None else arguments))
+
+
+def exit_code(work: Callable[[], int | None]) -> int:
+    """Do a command's work and turn what stops it into the exit code of the process.
+
+    Returns:
+      What `work` returns, or 0 if that is None; 2 after one line on standard error for a mistake of the user's; 130
+      when interrupted (what was written before stays valid, and the same command continues).
+    """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job manager's stop is an interruption
     try:
         try:
-            tyro.extras.subcommand_cli_from_dict(
-                commands, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,)
-            )
+            return work() or 0
         finally:
             sys.stdout.flush()
-    except BrokenPipeError:  # who reads what we say, such as `head`, has seen enough
+    except BrokenPipeError:  # the reader of our output, such as `head`, has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except UserError as error:
@@ -186,4 +229,18 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from here", file=sys.stderr)
         return 130
-    return 0
+
+
+def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> None:
+    """Call the command that `arguments` name; its own help is whole, the list of all gives each a sentence."""
+    choices = tuple(
+        Annotated[
+            Any,
+            tyro.conf.subcommand(
+                name, constructor=command, description=_described(command, whole=name in arguments[:1])
+            ),
+        ]
+        for name, command in commands.items()
+    )
+    one_of_them: Any = Union[choices]  # noqa: UP007  a tuple
+    tyro.cli(one_of_them, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,))

@@ -6,9 +6,10 @@ The engines themselves are in `dipn_jax.physics`; whoever simulates is handed on
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
-from dipn_jax.structs import Array, Rollout, Scene, Trajectory
+if TYPE_CHECKING:  # the commands name an engine without importing JAX
+    from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
 EngineName = Literal["auto", "native", "mjx", "warp"]
 

@@ -1,19 +1,24 @@
-"""What the commands of `dipn-eval` share: options that make sense, results that are written."""
+"""What the commands of `dipn-eval` share: options, their checks, results that are written. Imports no JAX."""
 
 from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
 
 from dipn_jax import console
-from dipn_jax.storage import resume
 
-from . import metrics
+if TYPE_CHECKING:
+    from dipn_jax.storage import resume
+
+Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
+"""Number of objects in a scene."""
 
 
 def check(out: pathlib.Path, seed: int, **counts: int) -> None:
-    """Refuse counts that are not positive, a seed that is none, an `out` that cannot be a folder."""
+    """Refuse counts that are not positive, a seed that is not one, an `out` that cannot be a folder."""
     console.require_positive(**counts)
     console.require_seed(seed)
     console.require_out(out)
@@ -29,7 +34,9 @@ def plain(value: Any) -> Any:
 
 
 def finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], partial: resume.Partial) -> None:
-    """Write the metrics of an evaluation, drop what it kept for going on, and say them."""
+    """Write the metrics of an evaluation, delete what it kept in case of an interruption, and print the metrics."""
+    from . import metrics
+
     metrics.write(out, values, settings={key: plain(value) for key, value in settings.items()})
     partial.finish()
     for name, value in values.items():

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import pathlib
 from typing import Any
 
-import dipn_jax  # noqa: F401  isort: skip  settings that must be made before JAX is imported
+os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as `console` sets it for the commands: JAX reads it when it is imported
 
 import jax
 import numpy as np

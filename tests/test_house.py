@@ -14,9 +14,11 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
 STAGES = ("datagen", "train", "eval")
+# what stands on top of everything else, and is not in the wheel
+TOPS = ("benchmarks", "experiments")
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "files", "structs", "workspace", "geometry", "batching", "engine",
+    "errors", "files", "machine", "structs", "workspace", "geometry", "batching", "engine",
     "world", "physics", "sight", "networks", "storage", "planning", "console",
 ]  # fmt: skip
 
@@ -58,6 +60,13 @@ def test_the_library_imports_no_stage() -> None:
     for path in (ROOT / "dipn_jax").rglob("*.py"):
         for stage in STAGES:
             assert not _within(_imports(path), stage) + _within(_imports(path), f"dipn_jax.{stage}"), path
+
+
+@pytest.mark.parametrize("top", TOPS)
+def test_nobody_imports_benchmarks_or_experiments_and_neither_imports_the_other(top: str) -> None:
+    for package in {"dipn_jax", *STAGES, *TOPS} - {top}:
+        for path in (ROOT / package).rglob("*.py"):
+            assert not _within(_imports(path), top), path
 
 
 def test_inside_the_library_the_arrows_point_one_way() -> None:
@@ -114,7 +123,7 @@ def test_conventions() -> None:
 
 
 def test_every_module_has_a_docstring_and_is_of_readable_size() -> None:
-    for package in ("dipn_jax", *STAGES):
+    for package in ("dipn_jax", *STAGES, *TOPS):
         for path in (ROOT / package).rglob("*.py"):
             text = path.read_text()
             if text.strip():
@@ -139,7 +148,7 @@ def test_the_wheel_holds_all_four_packages_and_the_data(tmp_path: pathlib.Path) 
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
     assert "dipn_jax/data/hard_cases.json" in names and "dipn_jax/py.typed" in names
-    assert not any(name.startswith(("tests", "benchmarks")) for name in names)
+    assert not any(name.startswith(("tests", *TOPS)) for name in names)
     site = tmp_path / "site"
     subprocess.run(
         [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(site), str(wheel)], check=True

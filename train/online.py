@@ -1,4 +1,4 @@
-"""GN learns while it grasps: act greedily on several tables at once, learn from each outcome (the paper's way)."""
+"""Learning of GN while it grasps: act greedily on several tables at once, learn from each outcome (as in the paper)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from typing import Any
 
 import jax
 import numpy as np
-import optax
 from flax import nnx
 
 from dipn_jax import files, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
-from dipn_jax.networks.grasp import GraspConfig, score_image
+from dipn_jax.networks.grasp import GraspNet, score_image
 from dipn_jax.planning import candidates
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint
@@ -26,57 +25,38 @@ from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
 
 from . import tables
-from .grasp import PHASE, WINDOWS, Window, executed_loss, windows
-from .loop import make_step
+from .configs import OnlineConfig
+from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
+from .loop import constant_adamw, make_step
 from .rounds import Run
 from .tables import Tables
 
-RECENT = 50
-"""Grasps over which the success of the moment is counted."""
-
-
-@dataclasses.dataclass(frozen=True)
-class OnlineConfig:
-    """How to learn."""
-
-    grasps: int = 300
-    tables: int = 10
-    updates: int = 20  # optimizer steps after each round of one grasp a table
-    batch: int = 32
-    learning_rate: float = 5e-4
-    weight_decay: float = 1e-4
-    seed: int = 0
-    pretrained: bool = False  # whether the network has learnt from images; for the record
+RECENT_GRASPS = 50
+"""The number of last grasps over which success is counted."""
 
 
 @dataclasses.dataclass
 class State:
-    """Everything that a run is at a moment."""
+    """Everything that an interrupted run needs to continue."""
 
     params: Any  # of the network
     moments: Any  # of the optimizer
     tables: Tables
     round: int = 0
-    seen: list[Window] = dataclasses.field(default_factory=list)  # what was tried, a batch a round
+    seen: list[Window] = dataclasses.field(default_factory=list)  # executed grasps, a batch for each round
     success: list[bool] = dataclasses.field(default_factory=list)  # in the order of the grasps
 
 
 def learn(
-    model: nnx.Module,
-    network_config: GraspConfig,
-    engine: Engine,
-    scenes: SceneConfig,
-    config: OnlineConfig,
-    out: pathlib.Path,
+    model: GraspNet, engine: Engine, scenes: SceneConfig, config: OnlineConfig, out: pathlib.Path
 ) -> dict[str, float]:
-    """Learn online in the folder `out`; a run that was interrupted goes on.
+    """Learn online in the folder `out`; a run that was interrupted continues.
 
     Args:
-      model: network to begin with.
-      network_config: its architecture.
+      model: network to begin with; a compact one.
       engine: physics.
-      scenes: what is grasped.
-      config: how.
+      scenes: distribution of fresh tables.
+      config: how to learn.
       out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
 
     Returns:
@@ -85,25 +65,31 @@ def learn(
     Raises:
       UserError: the network is not compact, or the folder holds another run.
     """
-    if network_config.preset != "compact":
+    if model.config.preset != "compact":
         raise UserError(
-            f"grasp-online: takes a compact network, got {network_config.preset}; that one learns from a data set, by "
+            f"grasp-online: takes a compact network, got {model.config.preset}; that one learns from a data set, by "
             "dipn-train grasp"
         )
-    identity = {
-        "initial_weights": checkpoint.digest(model),
-        **dataclasses.asdict(config),
-        "scenes": str(scenes),
-        "engine": type(engine).__name__,
-    }
-    run = Run(out, identity)
+    identity = {"initial_weights": checkpoint.digest(model), **dataclasses.asdict(config), "scenes": str(scenes)}
+    run = Run(out, identity | {"engine": type(engine).__name__})
     ended = run.ended()
     if ended:
         return {name: ended[name] for name in ("success", "success_recent")}
+    state = _play(run, model, engine, scenes, config)
+    nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
+    result = {
+        "success": float(np.mean(state.success)),
+        "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
+    }
+    extra = {"seed": config.seed, "examples": len(state.success), **result}
+    run.finish(model, len(state.success), network="grasp", config=model.config, extra=extra)
+    return result
+
+
+def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> State:
+    """Grasp and learn to the end of the run."""
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
-    )
+    optimizer = constant_adamw(config)
     step = make_step(_Outcomes(), graph, optimizer)
     key = jax.random.key(config.seed)
     weights = jax.device_get(params)
@@ -113,30 +99,25 @@ def learn(
         return State(weights, jax.device_get(optimizer.init(weights)), begun)
 
     def act(state: State) -> str:
-        _grasp(state, functools.partial(_choose, graph, state.params, rest), engine, scenes)
+        _grasp(state, functools.partial(_best_grasps, graph, state.params, rest), engine, scenes)
         state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
-        return f"{np.mean(state.success[-RECENT:]):.2f} of the last {RECENT} held"
+        return f"{np.mean(state.success[-RECENT_GRASPS:]):.2f} of the last {RECENT_GRASPS} held"
 
-    log = functools.partial(_log, out, config)
-    state = run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
-    nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
-    result = {"success": float(np.mean(state.success)), "success_recent": float(np.mean(state.success[-RECENT:]))}
-    extra = {"seed": config.seed, "examples": len(state.success), **result}
-    run.finish(model, len(state.success), network="grasp", config=network_config, extra=extra)
-    return result
+    log = functools.partial(_log, run.out, config)
+    return run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
 
 
 class _Outcomes:
-    """What `make_step` wants to know of a task."""
+    """The part of a task that `make_step` needs."""
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
-        """Of executed grasps."""
+        """Cross entropy of executed grasps."""
         return executed_loss(key, model, batch)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _choose(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) -> Grasp:
-    """The best grasp on each of the tables `[T]`."""
+def _best_grasps(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) -> Grasp:
+    """Return the best grasp on each of the tables `[T]`."""
     network = nnx.merge(graph, params, rest)
     network.eval()
 
@@ -148,22 +129,24 @@ def _choose(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) 
     return jax.lax.map(one, (scene, poses))
 
 
-def _grasp(state: State, choose: Callable[..., Grasp], engine: Engine, scenes: SceneConfig) -> None:
-    """One grasp on every table; what is held is taken away; tables that are empty, or stuck, are set anew."""
+def _grasp(state: State, best_grasps: Callable[..., Grasp], engine: Engine, scenes: SceneConfig) -> None:
+    """Grasp once on every table, take away what is held, and replace tables that are empty or stuck."""
     before = state.tables
-    taken = jax.device_get(choose(before.scene, before.poses))
+    taken = jax.device_get(best_grasps(before.scene, before.poses))
     scene, poses, held, fault = clutter.grasp_away(engine, before.scene, before.poses, taken)
     good = Fault.usable(fault)
     success = np.asarray(held.any(1))
-    tried = GraspEpisode(before.scene, before.poses, poses, taken, held, success, fault)
+    tried = GraspEpisode(
+        scene=before.scene, poses=before.poses, after=poses, grasp=taken, held=held, success=success, fault=fault
+    )
     if good.any():
-        state.seen.append(windows(structs.take(tried, good), pixels=WINDOWS["compact"] + 2 * PHASE))
+        state.seen.append(windows(structs.take(tried, good), pixels=WINDOW_PIXELS["compact"] + 2 * SHIFT_PIXELS))
     state.success += [bool(one) for one in np.asarray(success)[good]]
     state.tables.step(scene, poses, success, good, engine, scenes)
 
 
 def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineConfig, key: jax.Array) -> tuple[Any, Any]:
-    """Some optimizer steps on everything tried so far."""
+    """Take some optimizer steps on everything tried so far."""
     if not state.seen:
         return state.params, state.moments
     seen = structs.concatenate(state.seen)
@@ -178,7 +161,7 @@ def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineCon
 
 
 def _log(out: pathlib.Path, config: OnlineConfig, state: State) -> None:
-    """`metrics.jsonl`: after so many grasps, success over the last ones."""
+    """Write `metrics.jsonl`: the number of grasps after each round, and success over the last of them."""
     counts = range(config.tables, len(state.success) + 1, config.tables)
-    rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT) : n]))} for n in counts]
+    rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT_GRASPS) : n]))} for n in counts]
     files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())

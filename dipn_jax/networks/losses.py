@@ -9,20 +9,21 @@ import numpy as np
 from dipn_jax.workspace import WORKSPACE
 
 PIXELS_DEGREES = np.array([1 / WORKSPACE.pixel, 1 / WORKSPACE.pixel, 180 / np.pi], np.float32)
-"""Metres, metres, radians -> the units of DIPN's loss (source: its released code)."""
-
+"""Factors from metres, metres, radians to the units of DIPN's loss: pixels, pixels, degrees (its released code)."""
 MOVED_DISTANCE = 0.003
+"""Metres beyond which an object counts as moved."""
 MOVED_ANGLE = np.deg2rad(3.0)
+"""Radians beyond which an object counts as moved."""
 
 
 def smooth_l1(error: jax.Array) -> jax.Array:
-    """0.5 e^2 where |e| < 1, |e| - 0.5 elsewhere."""
+    """Return 0.5 e^2 where |e| < 1, and |e| - 0.5 elsewhere."""
     size = jnp.abs(error)
     return jnp.where(size < 1, 0.5 * size**2, size - 0.5)
 
 
 def motion_loss(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean over objects of SmoothL1 summed over (dx, dy, dtheta).
+    """Return the mean over objects of SmoothL1 summed over (dx, dy, dtheta).
 
     Args:
       predicted: `[..., N, 3]` pixels, pixels, degrees.
@@ -34,18 +35,18 @@ def motion_loss(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax
 
 
 def score_loss(logits: jax.Array, target: jax.Array, weight: jax.Array) -> jax.Array:
-    """Weighted mean binary cross entropy of `logits [...]` against `target [...]` in [0, 1]."""
+    """Return the weighted mean binary cross entropy of `logits [...]` against `target [...]` in [0, 1]."""
     each = jnp.maximum(logits, 0) - logits * target + jnp.log1p(jnp.exp(-jnp.abs(logits)))
     return (each * weight).sum() / jnp.maximum(weight.sum(), 1e-6)
 
 
 def moved(motion: jax.Array) -> jax.Array:
-    """Which true motions `[..., 3]` (metres, radians) count as moved: over 3 mm or 3 degrees."""
+    """Return which true motions `[..., 3]` (metres, radians) count as moved: over 3 mm or 3 degrees."""
     return (jnp.linalg.norm(motion[..., :2], axis=-1) > MOVED_DISTANCE) | (jnp.abs(motion[..., 2]) > MOVED_ANGLE)
 
 
 def mask_errors(predicted: jax.Array, true: jax.Array, slots: int) -> tuple[jax.Array, jax.Array]:
-    """Both error measures of predicted label maps.
+    """Return both error measures of predicted label maps.
 
     Args:
       predicted: `[H, W]` int32 labels.

@@ -10,32 +10,32 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-SMALL = 2
-"""Pixels a side of a map up to which a convolution is written as one matrix product."""
+SMALL_MAP = 2
+"""Pixels along a side of a map up to which a convolution is written as one matrix product."""
 
 
 class Conv(nnx.Conv):
-    """`nnx.Conv` padded to keep the resolution, in the form that XLA differentiates fastest on a CPU.
+    """An `nnx.Conv` that keeps the resolution, in the form that XLA differentiates fastest on a CPU.
 
     Measured forward and backward on two cores: a 1x1 as a matrix product is 1.5 to 6 times as fast, a 3x3 of 512
     channels on 56 maps of 2x2 pixels 70 times, an 11x57 of one channel 10 times.
     """
 
     def __call__(self, x: jax.Array) -> jax.Array:  # type: ignore[override]
-        """`[B, H, W, C]` to `[B, H / stride, W / stride, features]`."""
+        """Convolve `[B, H, W, C]` to `[B, H / stride, W / stride, features]`."""
         kernel, bias = self.kernel[...], 0.0 if self.bias is None else self.bias[...]
         size, step = kernel.shape[0], self.strides[0]  # type: ignore[index]
         if kernel.shape[:2] == (1, 1):
             return x[:, ::step, ::step] @ kernel[0, 0] + bias
         if kernel.shape[2:] == (1, 1) and step == 1:
             return _banded(x[..., 0], kernel[..., 0, 0])[..., None] + bias
-        if size == kernel.shape[1] and max(x.shape[1:3]) <= SMALL * step:
+        if size == kernel.shape[1] and max(x.shape[1:3]) <= SMALL_MAP * step:
             return _patches(x, size, step) @ kernel.reshape(-1, kernel.shape[-1]) + bias
         return super().__call__(x)
 
 
 def _banded(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """A convolution of maps `[B, H, W]` of one channel, kernel of odd sides: a matrix product for each of its rows."""
+    """Convolve maps `[B, H, W]` of one channel with a kernel of odd sides, by a matrix product for each of its rows."""
     (rows, cols), (height, width) = kernel.shape, x.shape[1:]
     offset = np.arange(width)[:, None] - np.arange(width) + cols // 2
     inside = (offset >= 0) & (offset < cols)
@@ -45,7 +45,7 @@ def _banded(x: jax.Array, kernel: jax.Array) -> jax.Array:
 
 
 def _patches(x: jax.Array, size: int, step: int) -> jax.Array:
-    """Every `size` x `size` neighbourhood of a map, flattened: `[B, H / step, W / step, size^2 C]`."""
+    """Return every `size` x `size` neighbourhood of a map, flattened: `[B, H / step, W / step, size^2 C]`."""
     rows, cols = (side + 2 * (size // 2) - size + 1 for side in x.shape[1:3])
     edge = (size // 2, size // 2)
     x = jnp.pad(x, ((0, 0), edge, edge, (0, 0)))
@@ -54,7 +54,10 @@ def _patches(x: jax.Array, size: int, step: int) -> jax.Array:
 
 
 def max_pool(x: jax.Array) -> jax.Array:
-    """The largest of 3 x 3 at stride 2. Written out: on a CPU XLA differentiates `nnx.max_pool` 12 times slower."""
+    """Return the largest of 3 x 3 at stride 2; written out, because XLA differentiates `nnx.max_pool` slowly on a CPU.
+
+    It takes 12 times as long.
+    """
     for axis in (1, 2):
         edges = [(0, 0)] * 4
         edges[axis] = (1, 1)
@@ -67,7 +70,7 @@ def max_pool(x: jax.Array) -> jax.Array:
 def conv(
     features_in: int, features: int, size: int | tuple[int, int], rngs: nnx.Rngs, *, stride: int = 1, bias: bool = True
 ) -> Conv:
-    """A `size` x `size` convolution, padded to keep the resolution (over `stride`)."""
+    """Return a `size` x `size` convolution, padded to keep the resolution (over `stride`)."""
     kernel = (size, size) if isinstance(size, int) else size
     pad = tuple((k // 2, k // 2) for k in kernel)  # a tuple: graph definitions are hashed
     return Conv(features_in, features, kernel, strides=(stride, stride), padding=pad, use_bias=bias, rngs=rngs)
@@ -161,19 +164,19 @@ class MLP(nnx.Module):
 
 
 def space_to_depth(x: jax.Array, block: int) -> jax.Array:
-    """`[B, H, W, C]` to `[B, H / block, W / block, block^2 C]`."""
+    """Fold blocks of pixels into channels: `[B, H, W, C]` to `[B, H / block, W / block, block^2 C]`."""
     b, h, w, c = x.shape
     x = x.reshape(b, h // block, block, w // block, block, c).transpose(0, 1, 3, 2, 4, 5)
     return x.reshape(b, h // block, w // block, block * block * c)
 
 
 def depth_to_space(x: jax.Array, block: int) -> jax.Array:
-    """Inverse of `space_to_depth`."""
+    """Return the inverse of `space_to_depth`."""
     b, h, w, c = x.shape
     x = x.reshape(b, h, w, block, block, c // block**2).transpose(0, 1, 3, 2, 4, 5)
     return x.reshape(b, h * block, w * block, c // block**2)
 
 
 def upsample2(x: jax.Array) -> jax.Array:
-    """Nearest-neighbour doubling of `[B, H, W, C]`."""
+    """Double the resolution of `[B, H, W, C]` by repeating pixels."""
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)

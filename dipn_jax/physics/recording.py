@@ -1,4 +1,4 @@
-"""Traced bookkeeping of a rollout: set points, the fence's forces, sampled poses, faults on the way."""
+"""Traced bookkeeping of a rollout: set points, the fence's forces, sampled poses, what faults are judged by."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dipn_jax.world.model import GRIPPER_DOF
 
 @flax.struct.dataclass
 class State(Pytree):
-    """What passes from one substep to the next."""
+    """State that passes from one substep to the next."""
 
     qpos: jax.Array  # [6 + 7 N]
     qvel: jax.Array  # [6 + 6 N]
@@ -25,7 +25,7 @@ class State(Pytree):
 
 @flax.struct.dataclass
 class Record(Pytree):
-    """What is kept of a rollout; leading `[B]`."""
+    """Record of a rollout so far; every field has a leading `[B]`."""
 
     poses: Array  # [S, N, 7]
     gripper: Array  # [S, 5]
@@ -36,7 +36,7 @@ class Record(Pytree):
 
 
 def hold_in(mass: jax.Array, state: State) -> jax.Array:
-    """Generalized forces `[B, 6 + 6 N]` of the fence on objects of `mass [B, N]`, zero for empty slots."""
+    """Return the fence's generalized forces `[B, 6 + 6 N]` on objects of `mass [B, N]`, which is 0 for empty slots."""
     position = state.qpos[:, GRIPPER_DOF:].reshape(*mass.shape, 7)[..., :2]
     velocity = state.qvel[:, GRIPPER_DOF:].reshape(*mass.shape, 6)[..., :2]
     force = jnp.zeros((*mass.shape, 6)).at[..., :2].set(physics.fence_force(mass, position, velocity))
@@ -44,7 +44,7 @@ def hold_in(mass: jax.Array, state: State) -> jax.Array:
 
 
 def control(trajectories: Trajectory, time: Array | float) -> jax.Array:
-    """Actuator set points `[B, 6]` at `time`: linear between key frames, gap split over both fingers."""
+    """Return actuator set points `[B, 6]` at `time`: linear between key frames, half the gap a finger."""
 
     def one(times: jax.Array, targets: jax.Array) -> jax.Array:
         index = jnp.clip((times <= time).sum() - 1, 0, len(times) - 2)
@@ -57,7 +57,7 @@ def control(trajectories: Trajectory, time: Array | float) -> jax.Array:
 
 
 def store(record: Record, state: State, now: jax.Array) -> Record:
-    """Keep the present state in the samples `now [S]`."""
+    """Store the present state as those samples that are taken `now [S]`."""
     gripper, poses = state.qpos[:, :GRIPPER_DOF], state.qpos[:, GRIPPER_DOF:]
     gripper = jnp.concatenate([gripper[:, :4], gripper[:, 4:].sum(-1, keepdims=True)], -1)
     poses = poses.reshape(record.poses.shape[:1] + record.poses.shape[2:])
@@ -68,7 +68,7 @@ def store(record: Record, state: State, now: jax.Array) -> Record:
 
 
 def velocity(state: State, scenes: Scene) -> jax.Array:
-    """Of the objects `[B, N, 6]`."""
+    """Return the velocities of the objects `[B, N, 6]`."""
     return state.qvel[:, GRIPPER_DOF:].reshape(*scenes.shape.shape, 6)
 
 

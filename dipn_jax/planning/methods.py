@@ -17,11 +17,11 @@ import numpy as np
 from dipn_jax.errors import UserError
 from dipn_jax.networks import vpg
 from dipn_jax.planning import planner, predictors, scorers
+from dipn_jax.planning.names import MethodName
 from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Decision, Observation
 
-MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
 NetworkRole = Literal["push", "grasp", "value"]
 ROLES: dict[NetworkRole, tuple[str, str]] = {
     "push": ("dipn", "push"),

@@ -1,15 +1,14 @@
-"""The only owner of the data set format.
+"""The format of data sets, which only this module reads and writes.
 
 A data set is a folder of Parquet shards and a `manifest.json`. Every column is a leaf of an episode
 struct, flattened, and quantized as `codec` says; its shape, dtype and quantum, the schema version, the kind,
-the config and the versions of the packages that made it stand in the shard's own metadata. A shard is
+the config and the versions of the packages that made it are in the shard's own metadata. A shard is
 written under a temporary name, synced and renamed, so a file with a shard's name is whole or was damaged
 later, which its SHA-256 shows.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import fcntl
 import hashlib
 import json
@@ -25,31 +24,29 @@ from dipn_jax import files, structs
 from dipn_jax.errors import UserError
 from dipn_jax.storage import codec
 
-
-class DamagedShard(UserError):
-    """A file that was a shard, or has a shard's name, and cannot be read as one."""
-
-
 SCHEMA_VERSION = 2
-COMPRESSION = 9
-"""Level of zstd: bytes of one place of all numbers stand together, which takes it a few milliseconds a shard."""
+"""Version of the format; shards of another version are refused."""
+COMPRESSION_LEVEL = 9
+"""Level of zstd; it takes a few milliseconds a shard, because bytes of the same place of all numbers are neighbours."""
 KINDS: dict[str, type] = {
     "push": structs.PushEpisode,
     "grasp": structs.GraspEpisode,
     "images": structs.SettledScene,
 }
+"""Kinds of data sets, and the struct of their episodes."""
 MANIFEST = "manifest.json"
-_META = b"dipn_jax"
+"""Name of the file that lists the shards of a data set."""
+_META_KEY = b"dipn_jax"
+"""Key of our entry in the metadata of a shard."""
+
+
+class DamagedShard(UserError):
+    """A file that was a shard, or has a shard's name, and cannot be read as one."""
 
 
 def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
-    """Where shard `index` of a data set lies."""
+    """Return the path of shard `index` of a data set."""
     return folder / f"shard-{index:05d}.parquet"
-
-
-def _columns(episodes: Any) -> dict[str, np.ndarray]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(episodes)
-    return {jax.tree_util.keystr(path).lstrip("."): np.asarray(leaf) for path, leaf in leaves}
 
 
 def write_shard(
@@ -62,10 +59,10 @@ def write_shard(
       index: the shard's number.
       episodes: a struct of `KINDS[kind]` with a leading `[B]` axis.
       kind: a key of KINDS.
-      config: JSON-able: what made it, the seed included.
-      faults: what was counted on the way.
+      config: what determines the data set, with its seed; it has to fit into JSON.
+      faults: counts of drops and faults.
     """
-    columns, coded = codec.encode(_columns(episodes))
+    columns, coded = codec.encode(codec.columns(episodes))
     arrays, specs = [], {}
     for name, value in columns.items():
         flat = np.ascontiguousarray(value).reshape(len(value), -1)
@@ -81,13 +78,13 @@ def write_shard(
         "versions": files.package_versions(),
     }
     table = pa.Table.from_arrays(arrays, names=list(columns))
-    table = table.replace_schema_metadata({_META: json.dumps(meta).encode()})
+    table = table.replace_schema_metadata({_META_KEY: json.dumps(meta).encode()})
     sink = pa.BufferOutputStream()
     pq.write_table(
         table,
         sink,
         compression="zstd",
-        compression_level=COMPRESSION,
+        compression_level=COMPRESSION_LEVEL,
         use_dictionary=False,
         column_encoding={f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in coded},
         write_page_checksum=True,
@@ -96,13 +93,13 @@ def write_shard(
 
 
 def read_meta(path: pathlib.Path) -> dict[str, Any]:
-    """A shard's own account of itself.
+    """Return the metadata of a shard.
 
     Raises:
       UserError: the file is missing, damaged, not a shard, or of another schema version.
     """
     try:
-        meta = json.loads(pq.read_schema(path).metadata[_META])
+        meta = json.loads(pq.read_schema(path).metadata[_META_KEY])
     except FileNotFoundError:
         raise UserError(f"shard {path}: not found; generate it again with dipn-datagen") from None
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
@@ -117,13 +114,13 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
 
 
 def count(path: pathlib.Path) -> int:
-    """Episodes in a shard."""
+    """Return the number of episodes in a shard."""
     read_meta(path)
     return pq.read_metadata(path).num_rows
 
 
 def read_shard(path: pathlib.Path, *, kind: str) -> Any:
-    """The episodes of a shard: a struct of `KINDS[kind]` with a leading `[B]` axis, numpy.
+    """Return the episodes of a shard: a struct of `KINDS[kind]` with a leading `[B]` axis, NumPy arrays.
 
     Raises:
       UserError: see `read_meta`; or the shard is of another kind.
@@ -140,25 +137,14 @@ def read_shard(path: pathlib.Path, *, kind: str) -> Any:
         flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
         columns[name] = flat.astype(spec["dtype"]).reshape(len(table), *spec["shape"])
     coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
-    return _assemble(KINDS[kind], codec.decode(columns, coded))
-
-
-def _assemble(struct: type, columns: dict[str, np.ndarray], prefix: str = "") -> Any:
-    nested = {"scene": structs.Scene, "push": structs.Push, "grasp": structs.Grasp}
-    values = {}
-    for field in dataclasses.fields(struct):
-        name = prefix + field.name
-        values[field.name] = (
-            _assemble(nested[field.name], columns, f"{name}.") if field.name in nested else columns[name]
-        )
-    return struct(**values)
+    return codec.assemble(KINDS[kind], codec.decode(columns, coded))
 
 
 def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """Account for every readable shard of the folder in `manifest.json`; returns it.
+    """List every readable shard of the folder in `manifest.json`, and return the manifest.
 
-    Entries of shards that are gone are dropped; a shard that is listed already is not read again. Workers that
-    share the folder take turns.
+    Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
+    folder take turns.
     """
     with (folder / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -166,6 +152,7 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
+    """Write the manifest anew, as `update_manifest` says, and return it."""
     known = _read_manifest(folder)["shards"] if (folder / MANIFEST).exists() else {}
     shards: dict[str, Any] = {}
     for path in sorted(folder.glob("shard-*.parquet")):
@@ -191,6 +178,7 @@ def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
+    """Return the manifest of a data set; raise UserError if it is missing or damaged."""
     path = folder / MANIFEST
     try:
         manifest = json.loads(path.read_text())
@@ -205,7 +193,7 @@ def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
-    """Shards that are missing, damaged or unlisted, each with what is wrong; empty if all is well."""
+    """Return the shards that are missing, damaged or unlisted, each with what is wrong; empty if none is."""
     manifest, problems = _read_manifest(folder), []
     for name, entry in manifest["shards"].items():
         path = folder / name
@@ -223,7 +211,7 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
 
 
 def repair(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Set damaged shards aside as `*.damaged`, and rebuild the manifest from the rest; returns what was set aside.
+    """Rename damaged shards to `*.damaged`, rebuild the manifest from the rest, and return the paths of the former.
 
     Raises:
       UserError: the folder is no data set, or holds shards of another schema version, which are not damaged.
@@ -250,7 +238,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def summary(folder: pathlib.Path) -> dict[str, Any]:
-    """What a data set holds: counts, bytes, faults, and the config and versions of its first shard."""
+    """Describe a data set: counts, bytes, faults, and the config and versions of its first shard."""
     manifest = _read_manifest(folder)
     faults: dict[str, int] = {}
     for entry in manifest["shards"].values():
@@ -288,7 +276,7 @@ def read_episodes(folder: pathlib.Path | str) -> Any:
 
 
 def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
-    """A whole data set in memory (a few kilobytes an episode), after checking every shard.
+    """Load a whole data set into memory (a few kilobytes an episode), after checking every shard.
 
     Args:
       folder: the data set.

@@ -14,6 +14,8 @@ from dipn_jax.structs import Scene
 from dipn_jax.workspace import GRIPPER, Gripper
 from dipn_jax.world import shapes
 
+MARK = "dipn_jax"
+"""Name of a custom number in our MJCF, by which the patches of MJX know our models (`physics.patches`)."""
 GRIPPER_DOF = 6
 """x, y, z, yaw, left finger, right finger; then 7 numbers of qpos (6 of qvel) an object."""
 OBJECT_FRICTION_RATIO = 0.5 / 0.35
@@ -172,7 +174,7 @@ def mjcf(
  iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="1e-8" jacobian="{jacobian}"
  sleep_tolerance="{c.sleep}"> <flag multiccd="enable" autoreset="disable"{sleep}/></option>
 <custom><numeric name="max_geom_pairs" data="{pairs}"/>
- <numeric name="max_contact_points" data="{contacts}"/></custom>
+ <numeric name="max_contact_points" data="{contacts}"/><numeric name="{MARK}" data="1"/></custom>
 <default><geom solref="{c.solref}" solimp="{c.solimp}"/><pair condim="3" solref="{c.solref}" solimp="{c.solimp}"/>
  <default class="object"><geom contype="1" conaffinity="3" condim="3"/></default>
  <default class="link">

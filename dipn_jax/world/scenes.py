@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from dipn_jax import geometry
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Array, Scene
 from dipn_jax.world import packing, shapes
+from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
 PAPER_COUNTS = (0.02, 0.05, 0.2, 0.35, 0.3, 0.05, 0.03)
 """P(1..7 objects) of the push data. Source: DIPN's released code."""
@@ -24,44 +25,6 @@ MIN_SIDE = 0.025
 
 NOMINAL_DENSITY, NOMINAL_FRICTION = 500.0, 0.35
 """kg/m^3, and between object and table: of what is not known."""
-
-Range: TypeAlias = tuple[float, float]
-BOUNDS = {"scale": (0.5, 1.2), "density": (10.0, 25_000.0), "friction": (0.01, 5.0)}
-"""Least and most of each range: cork to platinum; what the renderer's window and the fingers' height allow."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Ranges:
-    """What random objects are drawn from, all uniformly."""
-
-    items: tuple[str, ...] = ()
-    """Names from the catalogue (`shapes.CATALOGUE`); none given: all of them."""
-    scale: Range = (0.9, 1.03)
-    """Of each nominal dimension; no side is thinner than 25 mm, no diagonal longer than 126 mm."""
-    density: Range = (250.0, 750.0)
-    """kg/m^3."""
-    friction: Range = (0.28, 0.42)
-    """Sliding coefficient between object and table; between objects it is 0.5 / 0.35 of the larger of two."""
-    color_noise: float = 0.0
-    """Most by which each channel, in [0, 1], differs from a colour of the palette."""
-    packed: float = 0.0
-    """Share of scenes whose objects are not let fall but stand side by side in rows."""
-
-    def __post_init__(self) -> None:
-        for name, (least, most) in BOUNDS.items():
-            low, high = getattr(self, name)
-            if not least <= low <= high <= most:
-                raise UserError(f"--{name} {low:g} {high:g}: want two numbers from {least:g} to {most:g}, in order")
-        for name in ("color_noise", "packed"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UserError(f"--{name.replace('_', '-')} {getattr(self, name):g}: want 0 to 1")
-        names = [item.name for item in shapes.CATALOGUE]
-        unknown = [name for name in self.items if name not in names]
-        if unknown:
-            raise UserError(f"--items {' '.join(unknown)}: not in the catalogue; choose from {' '.join(sorted(names))}")
-
-
-DEFAULT_RANGES = Ranges()
 
 
 @dataclasses.dataclass(frozen=True)

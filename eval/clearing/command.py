@@ -4,30 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from dipn_jax import console
 from dipn_jax.engine import Engine, EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.physics import make_engine
-from dipn_jax.planning import predictors
-from dipn_jax.planning.methods import LONGEST_PUSH, MethodName, Networks, PolicyConfig
-from dipn_jax.storage import resume
-from dipn_jax.world import scenes
+from dipn_jax.planning.names import MethodName
 
-from .. import metrics, options
-from . import lockstep, on_tables, sweeping
-from .instances import Tables
-from .on_tables import TablePolicy
+from .. import options
+from .tables import DEFAULT_TABLES, Tables
+
+if TYPE_CHECKING:
+    from dipn_jax.planning.methods import PolicyConfig
+
+    from .on_tables import TablePolicy
 
 MAX_CANDIDATES = 4096
+"""Pushes that may be considered at a time."""
 SIMULATED_PUSH = 0.10
-"""Metres of a push that are simulated at least: a shorter one is looked at when a long one has ended."""
-
-
-DEFAULT_TABLES = Tables()
+"""Metres of a push that are simulated at least: the table is looked at when a push of this length would have ended."""
 
 
 def clear(
@@ -77,19 +74,39 @@ def clear(
       seed: of scenes, perturbations and candidates.
       engine: physics.
     """
-    settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
-    del settings["tables"]
-    options.check(out, seed, candidates=candidates)
-    config = PolicyConfig(candidates, (distance,), gamma, threshold, released, cautious)
-    _check(config)
+    settings = _settings(locals())
+    from dipn_jax.physics import make_engine
+    from dipn_jax.planning.methods import Networks, PolicyConfig
+
+    from . import on_tables
+
+    config = PolicyConfig(
+        candidates=candidates,
+        distances=(distance,),
+        gamma=gamma,
+        grasp_above=threshold,
+        released=released,
+        cautious=cautious,
+    )
+    _check(out, seed, config)
     networks, physics = Networks(push_net, grasp_net, value_net), make_engine(engine)
     (decide,) = on_tables.load(method, networks, physics, [config])
-    longest = max(distance, SIMULATED_PUSH)
-    _cleared(out, decide, physics, tables, settings, networks.runs(method), longest=longest, remember=remember)
+    longest, runs = max(distance, SIMULATED_PUSH), networks.runs(method)
+    _clear(out, decide, physics, tables, settings=settings, runs=runs, longest=longest, remember=remember)
 
 
-def _check(config: PolicyConfig) -> None:
-    """UserError for options that make no sense."""
+def _settings(given: dict[str, Any]) -> dict[str, Any]:
+    """The options of a command by name, those of its tables as `tables.NAME`."""
+    tables: Tables = given["tables"]
+    others = {key: value for key, value in given.items() if key != "tables"}
+    return others | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+
+
+def _check(out: pathlib.Path, seed: int, config: PolicyConfig) -> None:
+    """Refuse options that make no sense."""
+    from dipn_jax.planning.methods import LONGEST_PUSH
+
+    options.check(out, seed, candidates=config.candidates)
     console.require_between(1, MAX_CANDIDATES, candidates=config.candidates)
     for distance in config.distances:
         console.require_between(0.01, LONGEST_PUSH, distance=distance)
@@ -116,7 +133,7 @@ def sweep(
 
     Args:
       out: folder for metrics.json and sweep.png, and in a folder for each distance what dipn-eval clear writes.
-      push_net: run of dipn-train push, or builtin; beyond 10 cm objects go on as in the last centimetre.
+      push_net: run of dipn-train push, or builtin; beyond 10 cm objects continue as in the last centimetre.
       grasp_net: run of dipn-train grasp, or builtin.
       distances: first:last:step, metres, to 0.12.
       tables: which.
@@ -127,57 +144,92 @@ def sweep(
       seed: of scenes, perturbations and candidates.
       engine: physics.
     """
-    settings = dict(locals()) | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
-    settings |= {"method": "dipn+gn", "label": ""}
-    del settings["tables"]
+    settings = _settings(locals()) | {"method": "dipn+gn", "label": ""}
+    from dipn_jax.physics import make_engine
+    from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.storage import resume
+
+    from .. import metrics
+    from . import on_tables, sweeping
+
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
     if candidates < len(every):
         raise UserError(f"--candidates {candidates}: want at least one for each of the {len(every)} distances")
-    each = {sweeping.name(distance): (distance,) for distance in every} | {sweeping.CHOSEN: every}
-    options.check(out, seed, candidates=candidates)
-    configs = [PolicyConfig(candidates, spread, gamma, threshold) for spread in each.values()]
-    for config in configs:
-        _check(config)
+    chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold)
+    _check(out, seed, chosen)
+    configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
+    configs[sweeping.CHOSEN] = chosen
     networks, physics = Networks(push_net, grasp_net), make_engine(engine)
     runs = networks.runs("dipn+gn")
     kept = resume.Partial(out, settings, inputs=_inputs(runs, tables))
     ended: dict[str, dict[str, Any]] = kept.load({})
-    policies = on_tables.load("dipn+gn", networks, physics, configs)
-    for name, decide in zip(each, policies, strict=True):
+    policies = on_tables.load("dipn+gn", networks, physics, list(configs.values()))
+    for name, decide in zip(configs, policies, strict=True):
         if name not in ended:
             mine = settings | {"label": name}
-            ended[name] = _cleared(out / name, decide, physics, tables, mine, runs, longest=max(every))
+            ended[name] = _clear(out / name, decide, physics, tables, settings=mine, runs=runs, longest=max(every))
             kept.save(ended)
     values = {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
     if pushes:
-        predictor = predictors.load_predictor(push_net)
-        measure: dict[str, Any] = {"scenes": pushes, "seed": seed, "longest": max(every)}
-        values |= sweeping.prediction_errors(predictor, physics, scenes.PAPER, every, **measure)
+        values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
     sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
     metrics.write(out, values, settings={key: options.plain(value) for key, value in settings.items()})
     kept.finish()
     console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
 
 
+def _prediction_errors(
+    push_net: pathlib.Path, physics: Engine, distances: tuple[float, ...], *, scenes: int, seed: int
+) -> dict[str, float]:
+    """Errors of the predicted masks at each of `distances`, one push on each of `scenes` as published."""
+    from dipn_jax.planning.predictors import load_predictor
+    from dipn_jax.world.scenes import PAPER
+
+    from . import sweeping
+
+    predictor = load_predictor(push_net)
+    return sweeping.prediction_errors(
+        predictor, physics, PAPER, distances, scenes=scenes, seed=seed, longest=max(distances)
+    )
+
+
 def _inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]:
-    """What the course of things depends on, besides the options."""
+    """The runs and files that the results depend on, besides the options."""
     path = tables.path()
     return [*runs.values(), *([path] if path else [])]
 
 
-def _cleared(
+def _clear(
     out: pathlib.Path,
     decide: TablePolicy,
     physics: Engine,
     tables: Tables,
+    *,
     settings: dict[str, Any],
     runs: dict[str, pathlib.Path],
-    *,
     longest: float,
     remember: bool = True,
 ) -> dict[str, Any]:
-    """Clear tables and write what came of it; goes on where it was interrupted."""
+    """Clear tables and write the results; continues where it was interrupted.
+
+    Args:
+      out: folder of the results.
+      decide: decides on every table.
+      physics: physics.
+      tables: which tables.
+      settings: options, for `settings.json`.
+      runs: networks that `decide` uses.
+      longest: metres of the longest push.
+      remember: whether grasps like one that missed are doubted.
+
+    Returns:
+      The metrics.
+    """
+    from dipn_jax.storage import resume
+
+    from . import lockstep
+
     seed = settings["seed"]
     partial = resume.Partial(out, settings, inputs=_inputs(runs, tables))
     instances = tables.make(physics, seed=seed)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Any
 
 import jax
 import numpy as np
 
-from dipn_jax import console, structs
+from dipn_jax import structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.structs import Fault, Scene
@@ -93,44 +92,3 @@ def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instan
         Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
         for i, name in enumerate(names)
     ]
-
-
-@dataclasses.dataclass(frozen=True)
-class Tables:
-    """Which tables are cleared."""
-
-    cases: str = "hard"
-    """hard (the ten hand-placed instances), random, or a case file of your own."""
-    names: tuple[str, ...] = ()
-    """Only these cases of the file."""
-    objects: str = "10"
-    """Number of objects (random): 10, 1:7 (uniform), or `paper`."""
-    instances: int = 1
-    """Tables (random), or repeats of each case with perturbed physics."""
-
-    def __post_init__(self) -> None:
-        console.require_positive(instances=self.instances)
-        if self.names and self.cases == "random":
-            raise UserError("--names: random tables have none; give --cases hard or a case file")
-
-    def path(self) -> pathlib.Path | None:
-        """The case file, if there is one."""
-        if self.cases == "random":
-            return None
-        return case_files.hard_cases_path() if self.cases == "hard" else pathlib.Path(self.cases)
-
-    def slots(self) -> int:
-        """Most objects on one of them."""
-        path = self.path()
-        if path is None:
-            return scenes.parse_objects(self.objects).slots
-        return int(case_files.load_cases(path)[1].shape.shape[1])
-
-    def make(self, engine: Engine, *, seed: int) -> list[Instance]:
-        """All of them, at rest."""
-        path = self.path()
-        if path is None:
-            config = scenes.parse_objects(self.objects)
-            return random_instances(engine, config, count=self.instances, seed=seed)
-        options: dict[str, Any] = {"slots": self.slots(), "repeats": self.instances, "seed": seed}
-        return hard_instances(engine, path, list(self.names) or None, **options)

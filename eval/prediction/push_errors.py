@@ -11,31 +11,31 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import batching, console, geometry, structs
+from dipn_jax import batching, console, geometry
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
 from dipn_jax.networks.dipn import DIPN
-from dipn_jax.planning import candidates
 from dipn_jax.planning.predictors import dipn_motions, static_predictor, trans_predictor
-from dipn_jax.sight import imagine, masks, render, segment
+from dipn_jax.sight import imagine, masks, segment
 from dipn_jax.storage import resume
-from dipn_jax.structs import Fault, Observation, Push, Scene, SettledScene
-from dipn_jax.workspace import PUSH_STEPS
-from dipn_jax.world import clutter, primitives
-from dipn_jax.world.scenes import SceneConfig, nominal
+from dipn_jax.structs import Observation, Push
+from dipn_jax.world.scenes import SceneConfig
+
+from .pushes import DISTANCES, Executed, execute
 
 MAX_ATTEMPTS = 100
 """Batches without a usable push before giving up."""
-DISTANCES = (5, 10)
-"""Centimetres at which errors are reported."""
 FILMS = 6
 """Pushes kept as pictures."""
+SEGMENTED = "_segmented"
+"""Ends the name of a predictor that is given masks found in the image."""
 _METRES = np.array(DISTANCES, np.float32) * 0.01
 
 Predict = Callable[[Observation, Push], jax.Array]
 """(observations [B], pushes [B]) -> motion [B, K, N, 3] after DISTANCES: dx, dy (metres), dtheta (radians)."""
 Rows = dict[str, list[np.ndarray]]
+"""Errors `[B, K, N]` of each batch, by predictor and measure; what was `visible` and what `moved`."""
 
 
 def evaluate(
@@ -64,39 +64,39 @@ def evaluate(
     Returns:
       Flat metrics, and pictures `[F, ...]` of some pushes (before, predicted, after 10 cm).
     """
-    slots = config.slots
-    predictors = {name: network_predictor(network) for name, network in networks.items()}
-    predictors |= {
-        "static": _at_distances(static_predictor),
-        "trans": _at_distances(trans_predictor),
-    }
+    predictors = _with_baselines(networks)
     rows: Rows = {}
     films: list[dict[str, np.ndarray]] = []
     done, batch, rows, films = partial.load((0, 0, rows, films))
     with console.Progress("prediction", scenes, unit="pushes", done=done) as progress:
         empty = 0
         while done < scenes:
-            drop, aim = jax.random.split(jax.random.fold_in(jax.random.key(seed), batch))
-            items = clutter.settled_scenes(drop, engine, config, min(batching.BATCH, scenes - done))
-            pushes, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)
-            items, pushes, truth, rolled = _execute(engine, items, pushes, np.asarray(feasible), physics)
-            if len(pushes.angle):
-                seen = jax.tree.map(np.asarray, render.observe(items.scene, items.poses))
-                after = _labels_after(items.scene, truth)
-                first = measure(rows, "", predictors, seen, seen, pushes, truth, after, rolled)
+            count = min(batching.BATCH, scenes - done)
+            executed = execute(jax.random.fold_in(jax.random.key(seed), batch), engine, config, count, physics=physics)
+            if len(executed):
+                seen = executed.seen()
+                motions = measure(rows, executed, predictors, seen)
                 if segmented:
-                    found = seen.replace(label=_found(seen, slots))
-                    measure(rows, "_segmented", predictors, found, seen, pushes, truth, after, rolled)
-                for i in range(min(FILMS - len(films), len(pushes.angle))):
-                    films.append(_film(items, pushes, seen, first, truth, i))
-            empty = 0 if len(pushes.angle) else empty + 1
+                    found = seen.replace(label=_found(seen, config.slots))
+                    measure(rows, executed, predictors, found, suffix=SEGMENTED)
+                films += [executed.film(seen, motions, i) for i in range(min(FILMS - len(films), len(executed)))]
+            empty = 0 if len(executed) else empty + 1
             if empty == MAX_ATTEMPTS:
                 raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; loosen the scenes")
-            progress.advance(len(pushes.angle))
-            done, batch = done + len(pushes.angle), batch + 1
+            progress.advance(len(executed))
+            done, batch = done + len(executed), batch + 1
             partial.save((done, batch, rows, films))
     names = [*predictors, *(["physics"] if physics else [])]
     return _summary(rows, names, segmented), {k: np.stack([film[k] for film in films]) for k in films[0]}
+
+
+def _with_baselines(networks: Mapping[str, DIPN]) -> dict[str, Predict]:
+    """The networks as predictors, then `static` (nothing moves) and `trans` (the pushed object moves along)."""
+    predictors = {name: network_predictor(network) for name, network in networks.items()}
+    return predictors | {
+        "static": at_distances(static_predictor),
+        "trans": at_distances(trans_predictor),
+    }
 
 
 def network_predictor(network: DIPN) -> Predict:
@@ -113,7 +113,7 @@ def _network_motions(graph: Any, state: Any, seen: Observation, pushes: Push, di
     return dipn_motions(nnx.merge(graph, state), seen, pushes, distances)
 
 
-def _at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict:
+def at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict:
     """A planner's predictor as one of batches; a baseline's push is made once for each distance."""
 
     @jax.jit
@@ -127,44 +127,6 @@ def _at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predic
     return lambda seen, pushes: batching.in_batches(predict, seen, pushes)
 
 
-def _execute(
-    engine: Engine, items: SettledScene, pushes: Push, feasible: np.ndarray, physics: bool
-) -> tuple[SettledScene, Push, np.ndarray, np.ndarray | None]:
-    """The feasible pushes that went well, poses `[B, 1 + K, N, 7]` before and after, and after nominal ones."""
-    items, pushes = structs.take(items, feasible), structs.take(pushes, feasible)
-    if not feasible.any():
-        return items, pushes, np.zeros((0,)), None
-    result = primitives.push(engine, items.scene, items.poses, pushes)
-    good = (np.asarray(result.fault) & Fault.UNUSABLE) == 0
-    rolled = None
-    if physics:
-        guessed = primitives.push(engine, nominal(items.scene), items.poses, pushes)
-        rolled = np.asarray(guessed.poses)[good][:, list(DISTANCES)]
-    truth = np.asarray(result.poses)[good][:, [0, *DISTANCES]]
-    return structs.take(items, good), structs.take(pushes, good), truth, rolled
-
-
-def _one_push(keys: jax.Array, scene: Scene, poses: Any) -> tuple[Push, jax.Array]:
-    return batching.in_batches(_push_each, keys, scene, poses)
-
-
-@jax.jit
-def _push_each(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Push, jax.Array]:
-    def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Push, jax.Array]:
-        key, one_scene, one_poses = args
-        seen = render.render(one_scene, one_poses)
-        pushes, feasible = candidates.sample_pushes(key, seen, count=1, distance=PUSH_STEPS * 0.01)
-        return jax.tree.map(lambda leaf: leaf[0], pushes), feasible[0]
-
-    return jax.lax.map(one, (keys, jax.tree.map(jnp.asarray, scene), jnp.asarray(poses)))
-
-
-def _labels_after(scene: Scene, truth: np.ndarray) -> np.ndarray:
-    """True labels `[B, K, H, W]` after each distance."""
-    each = [render.observe(scene, truth[:, 1 + k]).label for k in range(len(DISTANCES))]
-    return np.stack([np.asarray(label) for label in each], 1)
-
-
 def _found(seen: Observation, slots: int) -> np.ndarray:
     """Labels `[B, H, W]` of masks found in the images, numbered as the objects that they overlap most."""
     images = zip(seen.height, seen.color, seen.label, strict=True)
@@ -172,38 +134,27 @@ def _found(seen: Observation, slots: int) -> np.ndarray:
 
 
 def measure(
-    rows: Rows,
-    suffix: str,
-    predictors: Mapping[str, Predict],
-    seen: Observation,
-    true: Observation,
-    pushes: Push,
-    truth: np.ndarray,
-    after: np.ndarray,
-    rolled: np.ndarray | None,
+    rows: Rows, executed: Executed, predictors: Mapping[str, Predict], seen: Observation, *, suffix: str = ""
 ) -> np.ndarray:
     """Append the errors of a batch to `rows`; returns the first predictor's motions `[B, K, N, 3]`.
 
     Args:
-      rows: grows by `NAME SUFFIX/MEASURE` `[B, K, N]` a predictor, and by `visible` and `moved`.
-      suffix: of the names.
+      rows: grows by `NAME SUFFIX/MEASURE` `[B, K, N]` for each predictor, and by `visible` and `moved` where there is
+        no suffix: `seen` then has the true labels.
+      executed: pushes `[B]` and what they did; `rolled` is measured as the predictor `physics`.
       predictors: what to measure.
       seen: `[B]` what the predictors see.
-      true: `[B]` the same with the true labels.
-      pushes: `[B]`.
-      truth: `[B, 1 + K, N, 7]` poses before and after each distance.
-      after: `[B, K, H, W]` true labels after.
-      rolled: `[B, K, N, 7]` poses after nominal pushes, measured as `physics`.
+      suffix: of the predictors' names.
     """
-    slots = truth.shape[2]
+    truth, after = executed.truth, executed.labels_after
     centers, motion = batching.in_batches(_true_motion, seen.label, truth)
     if not suffix:
-        visible = np.asarray((true.label[..., None] == np.arange(slots)).any((1, 2)))
+        visible = np.asarray((seen.label[..., None] == np.arange(truth.shape[2])).any((1, 2)))
         rows.setdefault("visible", []).append(np.repeat(visible[:, None], len(DISTANCES), 1))
         rows.setdefault("moved", []).append(np.asarray(losses.moved(motion)) & visible[:, None])
-    motions = {name: predictor(seen, pushes) for name, predictor in predictors.items()}
-    if rolled is not None:
-        before_rolled = np.concatenate([truth[:, :1], rolled], 1)
+    motions = {name: predictor(seen, executed.pushes) for name, predictor in predictors.items()}
+    if executed.rolled is not None:
+        before_rolled = np.concatenate([truth[:, :1], executed.rolled], 1)
         motions["physics"] = batching.in_batches(_true_motion, seen.label, before_rolled)[1]
     for name, predicted in motions.items():
         errors = batching.in_batches(_errors, seen, centers, predicted, motion, after)
@@ -258,27 +209,11 @@ def _summary(rows: Rows, names: list[str], segmented: bool) -> dict[str, float]:
                 metrics[f"{key}/{at}/moved"] = mean(f"{name}/{key}", k, moved)
                 if segmented:
                     title = key.replace("push_error", "push_error_segmented")
-                    metrics[f"{title}/{at}/all"] = mean(f"{name}_segmented/{key}", k, visible)
-                    metrics[f"{title}/{at}/moved"] = mean(f"{name}_segmented/{key}", k, moved)
+                    metrics[f"{title}/{at}/all"] = mean(f"{name}{SEGMENTED}/{key}", k, visible)
+                    metrics[f"{title}/{at}/moved"] = mean(f"{name}{SEGMENTED}/{key}", k, moved)
             for key in ("push_position_mm", "push_angle_deg"):
                 metrics[f"{key}/{at}/moved"] = mean(f"{name}/{key}", k, moved)
         metrics[f"objects_moved/{centimetres}cm"] = int(moved.sum())
     metrics["objects"] = int(visible.sum())
     metrics["pushes"] = len(visible)
     return metrics
-
-
-def _film(
-    items: SettledScene, pushes: Push, seen: Observation, motions: np.ndarray, truth: np.ndarray, i: int
-) -> dict[str, np.ndarray]:
-    """Pictures of push `i` of a batch: before, predicted, after the longest distance."""
-    image = structs.take(seen, i)
-    centers, _ = masks.mask_centers(jnp.asarray(image.label), truth.shape[2])
-    after = render.render(structs.take(items.scene, i), truth[i, -1])
-    push = structs.take(pushes, i)
-    return {
-        "before": np.asarray(image.color),
-        "predicted": np.asarray(imagine.imagine(image, centers, motions[i, -1]).color),
-        "after": np.asarray(after.color),
-        "push": np.array([*np.asarray(push.start), push.angle, DISTANCES[-1] * 0.01], np.float32),
-    }

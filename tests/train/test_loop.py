@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from dipn_jax.train import grasp as grasp_task
 from dipn_jax.train import online
-from dipn_jax.train.grasp import PHASE, GraspTask, PretrainTask, view
+from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
 from dipn_jax.train.push import PushTask
 from flax import nnx
@@ -112,7 +112,7 @@ def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pat
     scene = scenes.fixed_count(3, spread=0.2)
 
     def learn(out: pathlib.Path) -> dict[str, float]:
-        return online.learn(checkpoint.build("grasp", network), network, engine, scene, plan, out)
+        return online.learn(checkpoint.build("grasp", network), engine, scene, plan, out)
 
     whole = learn(tmp_path / "a")
     with pytest.MonkeyPatch.context() as patch:
@@ -132,7 +132,7 @@ def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pat
     assert [line["step"] for line in lines] == [2, 4, 6]
     published = GraspConfig(preset="paper", stages=(1, 1, 1, 1))
     with pytest.raises(UserError, match="takes a compact network"):
-        online.learn(checkpoint.build("grasp", published), published, engine, scene, plan, tmp_path / "c")
+        online.learn(checkpoint.build("grasp", published), engine, scene, plan, tmp_path / "c")
 
 
 def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path]) -> None:
@@ -146,7 +146,7 @@ def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path])
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig(width=8))
     episodes = structs.take(task.train_set, np.arange(6))
-    begin = jax.random.randint(jax.random.key(0), (6, 2), 0, 2 * PHASE)
+    begin = jax.random.randint(jax.random.key(0), (6, 2), 0, 2 * SHIFT_PIXELS)
     images, pixel = view(task.fetch(np.arange(6)), begin)
     height = np.asarray(images)[np.arange(6), pixel[:, 0], pixel[:, 1], 3]
     _, row, col = candidates.grasp_index(episodes.grasp).T

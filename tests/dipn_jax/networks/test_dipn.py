@@ -5,16 +5,14 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from flax import nnx
 
 from dipn_jax import geometry, structs
-from dipn_jax.networks import dipn, grasp, losses, push_frame
+from dipn_jax.networks import dipn, losses, push_frame
 from dipn_jax.networks.push_frame import COMPACT, PAPER, PushInput
-from dipn_jax.sight import fingers, render
+from dipn_jax.sight import render
 from dipn_jax.structs import ABSENT, Push
-from dipn_jax.workspace import grasp_angles
 
 SLOTS = 5
 DISTANCES = np.tile(np.array([0.03, 0.05, 0.1], np.float32), (6, 1))
@@ -198,122 +196,13 @@ def test_a_distance_does_not_depend_on_which_others_are_asked(forward: Any, inpu
     np.testing.assert_allclose(halfway[:, :, 2], halfway[:, :, :2].mean(2), atol=1e-4)
 
 
-def test_compact_grasp_scores_are_of_the_pixel_they_stand_at() -> None:
-    # the score map of a turned image is the turned score map
-    model = grasp.GraspNet(grasp.GraspConfig(), rngs=nnx.Rngs(0))
-    model.eval()
-    image = jnp.zeros((224, 224, 4)).at[100:130, 60:90, 3].set(0.05)
-    scores = nnx.jit(grasp.score_image)(model, image)
-    assert scores.shape == (16, 224, 224)
-    assert (scores >= 0).all() and (scores <= 1).all()
-    np.testing.assert_array_equal(scores[3], scores[11])
-    quarter = nnx.jit(grasp.score_image)(model, jnp.rot90(image, k=-1, axes=(0, 1)))
-    # rot90 by -1 takes +x (columns) to +y (rows): rotation k becomes k + 4
-    want = jnp.rot90(scores[0], k=-1, axes=(0, 1))
-    assert np.corrcoef(np.ravel(quarter[4]), np.ravel(want))[0, 1] > 0.95
-
-
-def test_scores_by_tables_are_scores_of_turned_maps() -> None:
-    model = grasp.GraspNet(grasp.GraspConfig(width=8, coarse=8, blocks=1), rngs=nnx.Rngs(0))
-    model.eval()
-    table = jnp.array([*render.TABLE_COLOR, 0.0])
-    block = jnp.array([0.9, 0.1, 0.4, 0.05])
-    image = jnp.broadcast_to(table, (224, 224, 4)).at[80:130, 60:90].set(block)
-    half = jnp.asarray(grasp_angles())[:8]
-    views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, grasp.VIEW) + table)(half)
-    plain = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, 224))(nnx.sigmoid(model(views)), half)
-    plain = plain.at[:, image[..., 3] == 0].set(0.0)  # no grasp is centred on empty table
-    assert plain.max() > 0.1
-    quick = np.asarray(nnx.jit(grasp.score_image)(model, image))
-    assert (np.abs(quick[:8] - plain) < 1e-5).mean() > 0.999  # but for pixels at the border between two
-    np.testing.assert_array_equal(quick[8:], quick[:8])
-
-
-@pytest.mark.parametrize("preset", ["compact", "paper"])
-def test_grasp_scores_are_deterministic_and_each_image_has_its_own(preset: str) -> None:
-    model = grasp.GraspNet(grasp.GraspConfig(preset=preset, stages=(1, 1, 1, 1)), rngs=nnx.Rngs(0))
-    model.eval()
-    graph, state = nnx.split(model)
-    answer = jax.jit(lambda images: nnx.merge(graph, state)(images))
-    images = jax.random.uniform(jax.random.key(0), (2, 64, 64, 4))
-    there = answer(images)
-    np.testing.assert_array_equal(there, answer(images))
-    np.testing.assert_allclose(answer(images.at[1].set(0.0))[0], there[0], atol=1e-5)
-
-
-def test_geometric_labels_of_a_bar() -> None:
-    # a bar 50 mm wide across the closing direction can be grasped at its middle, not from its end
-    height = jnp.zeros((160, 160)).at[40:120, 68:93].set(0.05)
-    labels = fingers.geometric_labels(height)
-    assert labels[80, 80] == 1
-    assert labels[80, 40] == 0, "no object there"
-    turned = fingers.geometric_labels(height.T)
-    assert turned[80, 80] == 0, "the fingers would land on the bar"
-    crowded = fingers.geometric_labels(height.at[:, 102:112].set(0.05))
-    assert crowded[80, 80] == 0, "a finger would land on the neighbour"
-
-
-def test_a_finger_that_would_land_on_something_tall_makes_a_grasp_doubtful() -> None:
-    # a cube in the middle, and 38 to 56 mm to the right of its centre a wall: over a fingertip at 20 mm by 30, or by 15
-    cube = jnp.zeros((224, 224)).at[100:125, 100:125].set(0.05)
-    tall, low = (cube.at[60:164, 131:140].set(high) for high in (0.05, 0.035))
-    blocked = np.asarray(fingers.blocked_image(tall))
-    assert blocked.shape == (16, 224, 224)
-    assert blocked[[0, 8], 112, 112].all() and not blocked[[4, 12], 112, 112].any()
-    assert not np.asarray(fingers.blocked_image(low))[:, 112, 112].any()
-    high = jnp.zeros((224, 224)).at[100:125, 100:125].set(0.08).at[60:164, 131:140].set(0.055)
-    assert not np.asarray(fingers.blocked_image(high))[:, 112, 112].any()  # the tips go to 40 mm
-    cut = np.asarray(fingers.blocked_image(jnp.zeros((224, 224)).at[100:125, 195:].set(0.03)))
-    assert cut[0, 112, 205] and not cut[0, 112, 190] and not cut[4, 112, 205]  # one finger would be out of sight
-    assert cut[0, 140, 205] and not cut[0, 150, 205]  # 22 mm and 42 mm beside what is seen of it, a pad's half less
-    inside = np.asarray(fingers.blocked_image(jnp.zeros((224, 224)).at[100:125, 190:218].set(0.03)))
-    assert not inside[0, 112].any()
-    model = grasp.GraspNet(grasp.GraspConfig(width=8, coarse=8, blocks=1), rngs=nnx.Rngs(0))
-    model.eval()
-    images = [jnp.zeros((224, 224, 4)).at[..., 3].set(height) for height in (tall, low)]
-    scores = [np.asarray(nnx.jit(grasp.cautious_scores)(model, image)) for image in images]
-    for image, cautious in zip(images, scores, strict=True):
-        plain = np.asarray(nnx.jit(grasp.score_image)(model, image))
-        assert (cautious <= plain + 1e-5).mean() > 0.999
-    assert 0 < scores[0][0, 112, 112] <= 0.5 < scores[0][0, 112, 112] / scores[1][0, 112, 112] * 1.5
-
-
-def test_the_angles_are_sixteen_even_ones() -> None:
-    np.testing.assert_allclose(np.diff(grasp_angles()), np.pi / 8, atol=1e-6)
-
-
-def _one_step(model: Any, loss: Any) -> tuple[float, float]:
-    """Loss before and after one step of gradient descent."""
-    optimizer = nnx.Optimizer(model, optax.sgd(1e-4), wrt=nnx.Param)
-
-    @nnx.jit
-    def step(m: Any, o: Any) -> jax.Array:
-        value, gradient = nnx.value_and_grad(loss)(m)
-        o.update(m, gradient)
-        return value
-
-    return float(step(model, optimizer)), float(step(model, optimizer))
-
-
 @pytest.mark.slow
-def test_paper_dipn_takes_a_training_step(settled: Any) -> None:
+def test_paper_dipn_takes_a_training_step(settled: Any, one_step: Any) -> None:
     model = dipn.DIPN(dipn.DipnConfig(preset="paper"), rngs=nnx.Rngs(0))
     height, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     made, _ = push_frame.push_input(label, height, _push(), slots=SLOTS, view=PAPER)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
     target, distances = jnp.ones((2, SLOTS, 1, 3)), jnp.array([[0.05], [0.1]])
     mask = batch.present[..., None]
-    before, after = _one_step(model, lambda m: losses.motion_loss(m(batch, distances), target, mask))
-    assert np.isfinite(before) and after < before
-
-
-@pytest.mark.slow
-def test_paper_grasp_net_takes_a_training_step() -> None:
-    model = grasp.GraspNet(grasp.GraspConfig(preset="paper"), rngs=nnx.Rngs(0))
-    images = jnp.zeros((1, 320, 320, 4)).at[:, 100:150, 100:200, 3].set(0.05)
-    target = jnp.zeros((1, 320, 320)).at[:, 120, 150].set(1.0)
-    model.eval()
-    assert nnx.jit(lambda m, x: m(x))(model, images).shape == (1, 320, 320)
-    model.train()
-    before, after = _one_step(model, lambda m: losses.score_loss(m(images), target, jnp.ones_like(target)))
+    before, after = one_step(model, lambda m: losses.motion_loss(m(batch, distances), target, mask))
     assert np.isfinite(before) and after < before

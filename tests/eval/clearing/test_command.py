@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import command, instances, lockstep, on_tables, sweeping
-from dipn_jax.eval.clearing.instances import Instance, Tables
+from dipn_jax.eval.clearing.instances import Instance
+from dipn_jax.eval.clearing.tables import Tables
 from flax import nnx
 
 from dipn_jax import structs
@@ -175,7 +176,7 @@ def test_a_sweep_goes_on_at_the_distance_where_it_was_stopped(
         builtin = pathlib.Path("builtin")
         command.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), pushes=0, seed=seed)
 
-    monkeypatch.setattr(command, "_cleared", clear)
+    monkeypatch.setattr(command, "_clear", clear)
     with pytest.raises(KeyboardInterrupt):
         sweep(1)
     sweep(1)

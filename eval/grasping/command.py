@@ -1,0 +1,76 @@
+"""`dipn-eval grasp`."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated, Any
+
+import tyro
+
+from dipn_jax import console
+from dipn_jax.engine import EngineName
+from dipn_jax.errors import UserError
+from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
+
+from .. import options
+
+
+def grasp(
+    out: pathlib.Path,
+    grasp_net: pathlib.Path | None = None,
+    curve: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="curve")] = (),
+    scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 100,
+    objects: options.Objects = "10",
+    seed: int = 1_000_000,
+    others: int = 0,
+    engine: EngineName = "auto",
+    ranges: Ranges = DEFAULT_RANGES,
+) -> None:
+    """Success of the best-scored grasp, over every attempt until the tables are empty; a random grasp beside it.
+
+      dipn-eval grasp --grasp-net builtin --out results/grasp
+
+    Success against grasps learnt from, with a band over seeds (curve.png, and in metrics.json
+    online/{with,without}/GRASPS/...):
+      dipn-eval grasp --curve runs/online/* --out results/curve
+
+    Args:
+      out: folder for metrics.json, pictures and every step of every table.
+      grasp_net: run of dipn-train grasp, or builtin.
+      curve: runs of dipn-train grasp-online of different --seed, with and without --init.
+      scenes_: how many tables.
+      objects: number of objects on a table.
+      seed: of scenes and random grasps; keep it away from the training data's.
+      others: where a grasp missed, also try this many of the next best ones, to see what physics allows.
+      engine: physics.
+      ranges: what random objects are drawn from.
+    """
+    settings = dict(locals())
+    options.check(out, seed, scenes=scenes_)
+    console.require_between(0, 1024, others=others)
+    if not grasp_net and not curve:
+        raise UserError("grasp: nothing to measure; give --grasp-net or --curve")
+    from dipn_jax.physics import make_engine
+    from dipn_jax.planning import scorers
+    from dipn_jax.storage import checkpoint, resume
+    from dipn_jax.world import scenes
+
+    from .. import curves
+    from ..clearing import lockstep
+    from . import success
+
+    config, single = (scenes.parse_objects(count, ranges=ranges) for count in (objects, "1"))
+    run = checkpoint.find(grasp_net, network="grasp") if grasp_net else None
+    partial = resume.Partial(out, settings, inputs=[run] if run else [])
+    values: dict[str, Any] = curves.grasp_summary(curves.load_grasp_runs(curve))
+    if run:
+        physics, scorer = make_engine(engine), scorers.load_scorer(run)
+        found, tables = success.evaluate(scorer, physics, config, partial, scenes=scenes_, seed=seed, others=others)
+        alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
+        values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
+        lockstep.save(tables, out)
+        success.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
+    if curve:
+        out.mkdir(parents=True, exist_ok=True)
+        curves.grasp_figure(values).savefig(out / "curve.png", dpi=130)
+    options.finish(out, values, settings, partial)

@@ -1,0 +1,98 @@
+"""`dipn-eval prediction`."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from dipn_jax.engine import EngineName
+from dipn_jax.errors import UserError
+from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
+
+from .. import options
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+def predict(
+    out: pathlib.Path,
+    push_net: pathlib.Path | None = None,
+    curve: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="curve")] = (),
+    scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 300,
+    objects: options.Objects = "1:7",
+    seed: int = 1_000_000,
+    engine: EngineName = "auto",
+    physics: bool = True,
+    segmented: bool = True,
+    ranges: Ranges = DEFAULT_RANGES,
+) -> None:
+    """Error of the predicted masks after 5 and 10 cm of a push, on scenes never trained on.
+
+      dipn-eval prediction --push-net runs/dipn --out results/prediction
+      dipn-eval prediction --push-net builtin --density 1000 1500 --out results/heavier
+
+    Error against number of pushes, with a band over seeds (curve-all.png, curve-all.md, and in
+    metrics.json push_error/curve/PUSHES/...):
+      dipn-eval prediction --curve runs/curve/* --scenes 1000 --out results/curve
+
+    Args:
+      out: folder for metrics.json and pictures.
+      push_net: run of dipn-train push, or builtin: the network that comes with the package.
+      curve: runs of dipn-train push with different --limit and --seed.
+      scenes_: number of pushes, one in each scene.
+      objects: number of objects in a scene.
+      seed: of scenes and pushes; keep it away from the training data's.
+      engine: the engine whose result counts as the truth.
+      physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
+      segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
+      ranges: what random objects are drawn from.
+    """
+    settings = dict(locals())
+    options.check(out, seed, scenes=scenes_)
+    if not push_net and not curve:
+        raise UserError("prediction: nothing to measure; give --push-net or --curve")
+    from dipn_jax.physics import make_engine
+    from dipn_jax.storage import checkpoint, resume
+    from dipn_jax.world import scenes
+
+    from .. import curves
+    from . import push_errors
+
+    config = scenes.parse_objects(objects, ranges=ranges)
+    run = checkpoint.find(push_net, network="dipn") if push_net else None
+    runs = [checkpoint.find(each, network="dipn") for each in curve]
+    compared = curves.load_push_runs(runs)
+    networks: dict[str, Any] = {"dipn": checkpoint.load_network(run, network="dipn")} if run else {}
+    partial = resume.Partial(out, settings, inputs=[*([run] if run else []), *runs])
+    values, films = push_errors.evaluate(
+        networks | compared,
+        make_engine(engine),
+        config,
+        partial,
+        scenes=scenes_,
+        seed=seed,
+        physics=physics,
+        segmented=segmented,
+    )
+    kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in compared)}
+    values = kept | curves.push_summary(values, list(compared))
+    _save_pictures(out, films, values, curve=bool(curve))
+    options.finish(out, values, settings, partial)
+
+
+def _save_pictures(out: pathlib.Path, films: dict[str, np.ndarray], values: dict[str, float], *, curve: bool) -> None:
+    """Write `films.npz`, and the figures and tables of a learning curve where there is one."""
+    import numpy as np
+
+    from dipn_jax import files
+
+    from .. import curves
+
+    out.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(out / "films.npz", **films)  # type: ignore[arg-type]
+    for which in ("all", "moved") if curve else ():
+        curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
+        files.write_atomically(out / f"curve-{which}.md", curves.push_table(values, which=which).encode())

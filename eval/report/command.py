@@ -1,0 +1,37 @@
+"""`dipn-eval report`."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated
+
+import tyro
+
+from dipn_jax import console
+
+
+def report(
+    out: pathlib.Path,
+    predictions: Annotated[pathlib.Path | None, tyro.conf.arg(name="prediction")] = None,
+    grasps: Annotated[pathlib.Path | None, tyro.conf.arg(name="grasp")] = None,
+    clears: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="clear")] = (),
+    sweeps: Annotated[pathlib.Path | None, tyro.conf.arg(name="sweep")] = None,
+    runs: tuple[pathlib.Path, ...] = (),
+) -> None:
+    """One self-contained report.html from the folders of other commands, and their numbers in one metrics.json.
+
+      dipn-eval report --prediction results/prediction --clear results/hard results/30 --runs runs/dipn --out results
+
+    Args:
+      out: folder for report.html and metrics.json.
+      predictions: --out of dipn-eval prediction.
+      grasps: --out of dipn-eval grasp.
+      clears: --out of any number of dipn-eval clear: methods and tables side by side, beside the paper's numbers.
+      sweeps: --out of dipn-eval sweep.
+      runs: training runs, for their learning curves.
+    """
+    console.require_out(out)
+    from . import page
+
+    values = page.write(out, prediction=predictions, grasp=grasps, clears=list(clears), sweep=sweeps, runs=list(runs))
+    console.say(f"{out / 'report.html'}: {len(values)} numbers, also in {out / 'metrics.json'}")

@@ -1,0 +1,7 @@
+import numpy as np
+
+from dipn_jax.workspace import grasp_angles
+
+
+def test_the_angles_are_sixteen_even_ones() -> None:
+    np.testing.assert_allclose(np.diff(grasp_angles()), np.pi / 8, atol=1e-6)

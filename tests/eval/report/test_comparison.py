@@ -1,0 +1,31 @@
+import pathlib
+from typing import Any
+
+import numpy as np
+from dipn_jax.eval.clearing import film
+from dipn_jax.eval.report import comparison
+
+
+def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib.Path) -> None:
+    _, out = cleared
+    one = comparison.Cleared(out)
+    entry = one.episodes[0]
+    last = film.load(out / entry["file"]).what[-1]
+    assert comparison._cause(one, entry | {"ended": "out of actions"}) == "out of actions"
+    lost = comparison._cause(one, entry | {"ended": "pushed out"})
+    assert lost == ("pushed out" if last == "push" else "thrown out") and set(comparison.CAUSES) >= {lost}
+    assert comparison._tables_name("hard", "10") == "hard" and comparison._tables_name("random", "30") == "random-30"
+    assert (
+        comparison._tables_name("my/hard.json", "10") == "own-hard" and comparison._tables_name("my/a.json", "") == "a"
+    )
+
+
+def test_the_course_of_clearing_is_what_was_left_after_each_action(cleared: Any) -> None:
+    tables, out = cleared
+    shares = comparison.course(comparison.Cleared(out), np.array([0.0, 3.0]))
+    left = [(table.scene.shape >= 0).sum() / table.objects for table in tables]
+    np.testing.assert_allclose(shares, [1.0, np.mean(left)])
+    after = [(t.film[min(t.objects, len(t.film) - 1)]["shape"] >= 0).sum() / t.objects for t in tables]
+    late = [(t.scene.shape >= 0).sum() / t.objects for t in tables]
+    wanted = np.mean([a if len(t.film) > t.objects else b for t, a, b in zip(tables, after, late, strict=True)])
+    np.testing.assert_allclose(comparison.course(comparison.Cleared(out), np.ones(1)), wanted)

@@ -1,0 +1,83 @@
+"""How networks are trained: options of `dipn-train`, so importing this imports no JAX."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import tyro
+
+Preset = Literal["compact", "paper"]
+"""Architecture of a network: ours, or as published."""
+ShapeClass = Literal["cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave"]
+"""Classes of `shapes.CLASSES`."""
+MethodName = Literal["vpg", "rea", "dqn"]
+"""Compared methods that learn while they act."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How a network learns from a data set."""
+
+    steps: int = 2000
+    """Optimizer steps."""
+    batch: int = 32
+    """Examples in a step."""
+    learning_rate: float = 1e-3
+    """The highest learning rate of the run."""
+    weight_decay: float = 1e-4
+    """Weight decay."""
+    optimizer: Literal["adamw", "sgd"] = "adamw"
+    """adamw with cosine decay; or, as published, sgd with momentum 0.9 and a constant rate."""
+    seed: int = 0
+    """Seed of weights, order and augmentation."""
+    eval_every: int = 200
+    """Steps between points of the learning curve."""
+    save_every: int = 200
+    """Steps between checkpoints."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OnlineConfig:
+    """How GN learns while it grasps."""
+
+    grasps: int = 300
+    """Number of grasps."""
+    tables: int = 10
+    """Tables that are grasped from side by side."""
+    updates: int = 20
+    """Optimizer steps after each round of one grasp on every table."""
+    batch: int = 32
+    """Outcomes in a step."""
+    learning_rate: float = 5e-4
+    """Learning rate, constant."""
+    weight_decay: float = 1e-4
+    """Weight decay."""
+    seed: int = 0
+    """Seed of scenes, weights, order and augmentation."""
+    pretrained: tyro.conf.Suppress[bool] = False
+    """Whether the network has learnt from images; for the record."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BaselineConfig:
+    """How a compared method learns while it acts."""
+
+    method: MethodName = "vpg"
+    """vpg, rea or dqn."""
+    preset: Preset = "compact"
+    """Architecture; paper has two DenseNet-121 trunks for each primitive, for an accelerator."""
+    actions: int = 2500
+    """Pushes and grasps in all."""
+    tables: int = 10
+    """Tables that are acted on side by side."""
+    updates: int = 10
+    """Optimizer steps after each round of one action on every table."""
+    batch: int = 32
+    """Outcomes in a step, of pushes and of grasps each."""
+    learning_rate: float = 5e-4
+    """Learning rate, constant."""
+    weight_decay: float = 1e-4
+    """Weight decay."""
+    seed: int = 0
+    """Seed of scenes, weights, order and exploration."""
