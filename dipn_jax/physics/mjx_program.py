@@ -96,13 +96,18 @@ class Program:
         last = ticks.max()
         state, record = jax.lax.fori_loop(0, last, body, (state, record))
         record = recording.store(record, state, ticks == last)
-        end = target(last * physics.CONTROL_PERIOD)
-        fault = faults.codes(
+        fault = self._fault(scenes, state, record, target(last * physics.CONTROL_PERIOD), settle)
+        kept = jnp.where(present[:, None, :, None], record.poses, poses[:, None])
+        return Rollout(kept, record.gripper, fault)
+
+    def _fault(self, scenes: Scene, state: State, record: Record, target: jax.Array, settle: jax.Array) -> jax.Array:
+        """Return fault codes `[B]` at the end of a rollout, where the gripper should be at `target [B, 6]`."""
+        return faults.codes(
             scenes,
-            state.qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7),
+            state.qpos[:, GRIPPER_DOF:].reshape(*scenes.shape.shape, 7),
             recording.velocity(state, scenes),
             state.qpos[:, :3],
-            end[:, :3],
+            target[:, :3],
             top=record.top,
             stray=record.stray,
             broken=record.broken,
@@ -111,8 +116,6 @@ class Program:
             deepest=record.deepest,
             settle=settle,
         )
-        kept = jnp.where(present[:, None, :, None], record.poses, poses[:, None])
-        return Rollout(kept, record.gripper, fault)
 
     def _initial(self, poses: jax.Array, ctrl: jax.Array) -> State:
         rest = jnp.zeros(self.base.nv, jnp.float32)
