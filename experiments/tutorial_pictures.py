@@ -1,4 +1,4 @@
-"""`python -m experiments.tutorial_pictures`: the pictures of docs/tutorial.md, made by running the Python of that page."""
+"""Make the pictures of docs/tutorial.md with the code that stands on that page."""
 
 from __future__ import annotations
 
