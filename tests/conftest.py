@@ -5,6 +5,10 @@ from __future__ import annotations
 import pathlib
 from typing import Any
 
+from jaxtyping import install_import_hook
+
+install_import_hook("dipn_jax", "shape_checks.check")  # before anything of the library is imported
+
 import dipn_jax  # noqa: F401  isort: skip  settings that must be made before JAX is imported
 
 import jax

@@ -156,7 +156,7 @@ def push_reward(now: Look, then: Look, *, method: str) -> np.ndarray:
     return np.where(different & (gained >= COVERED), reward, 0.0)
 
 
-def with_future(reward: np.ndarray, then: Look, more: np.ndarray) -> np.ndarray:
+def with_future(reward: np.ndarray, then: Look, more: Array) -> np.ndarray:
     """Targets `[T]` of Q-learning: reward, and discounted value of the best next action where there is `more`."""
     future = np.minimum(np.maximum(then.push_value, then.grasp_value), MOST)
     return reward + DISCOUNT * np.where(more & np.isfinite(future), future, 0.0)

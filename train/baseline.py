@@ -25,7 +25,7 @@ from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.storage import checkpoint
-from dipn_jax.structs import Array, Grasp, GraspEpisode
+from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
 
 from . import acting, tables
@@ -67,7 +67,7 @@ class State:
     moments: Any
     tables: tables.Tables
     then: Look | None = None  # at the tables after their last action, by the weights of then
-    anew: Array = None  # [T] bool: those that were set anew since
+    anew: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(0, bool))  # [T]: those set anew since
     round: int = 0
     seen: dict[str, list[Window]] = dataclasses.field(default_factory=lambda: {"push": [], "grasp": []})
     did: list[tuple[str, float]] = dataclasses.field(default_factory=list)  # primitive and reward of each action

@@ -8,7 +8,7 @@ import json
 import logging
 import pathlib
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -38,6 +38,7 @@ class TrainConfig:
     save_every: int = 200
 
 
+@runtime_checkable
 class Taught(Protocol):
     """What an optimizer step needs of a task."""
 
@@ -46,6 +47,7 @@ class Taught(Protocol):
         ...
 
 
+@runtime_checkable
 class Task(Taught, Protocol):
     """Something to learn: data, a loss and a measure."""
 

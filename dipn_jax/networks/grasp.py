@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.errors import UserError
@@ -59,7 +60,7 @@ class _PaperTrunk(nnx.Module):
         self.wide1 = resnet.conv(1, 1, (11, 57), rngs)
         self.wide2 = resnet.conv(1, 1, (11, 57), rngs)
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
         maps = self.trunk(x)
         y = self.lateral[3](maps[3])
         for level in (2, 1, 0):
@@ -84,8 +85,8 @@ class _CompactTrunk(nnx.Module):
         self.head = resnet.conv(fine, 2 * fine, 3, rngs)
         self.out = resnet.conv(2 * fine, BLOCK**2, 1, rngs)
 
-    def cells(self, x: jax.Array) -> jax.Array:
-        """Logits `[B, h, w, 16]` of the pixels of cells `[B, h, w, 64]`; h and w even."""
+    def cells(self, x: Float[jax.Array, "B h w 64"]) -> Float[jax.Array, "B h w 16"]:
+        """Logits of the pixels of cells; h and w even."""
         fine = nnx.relu(self.stem(x))
         coarse = nnx.relu(self.down(fine))
         for block in self.blocks:
@@ -93,7 +94,7 @@ class _CompactTrunk(nnx.Module):
         both = nnx.relu(fine + resnet.depth_to_space(self.up(coarse), 2))
         return self.out(nnx.relu(self.head(both)))
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
         return resnet.depth_to_space(self.cells(resnet.space_to_depth(x, BLOCK)), BLOCK)[..., 0]
 
 
@@ -104,38 +105,38 @@ class GraspNet(nnx.Module):
         self.config = config
         self.body = (_PaperTrunk if config.preset == "paper" else _CompactTrunk)(config, rngs)
 
-    def __call__(self, images: jax.Array) -> jax.Array:
-        """Logits `[B, H, W]` of grasps centred on each pixel that close along the rows.
+    def __call__(self, images: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
+        """Logits of grasps centred on each pixel that close along the rows.
 
         Args:
-          images: `[B, H, W, 4]` RGB in [0, 1] and height in metres; sides divisible by 8 (`paper`: 32).
+          images: RGB in [0, 1] and height in metres; sides divisible by 8 (`paper`: 32).
         """
         return self.body(_normalized(images))
 
 
-def _normalized(images: jax.Array) -> jax.Array:
+def _normalized(images: Float[jax.Array, "*b H W 4"]) -> Float[jax.Array, "*b H W 4"]:
     """Images as the network sees them: the table is 0."""
     return (images - jnp.array([*render.TABLE_COLOR, 0.0])) / jnp.array(SCALE)
 
 
 def score_image(
     network: GraspNet,
-    image: jax.Array,
+    image: Float[jax.Array, "224 224 4"],
     *,
     action: Literal["grasp", "push"] = "grasp",
     squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
-) -> jax.Array:
+) -> Float[jax.Array, "16 224 224"]:
     """All grasps of one image, or all pushes.
 
     Args:
       network: GN, or another of its kind, in evaluation mode.
-      image: `[224, 224, 4]`.
+      image: RGB in [0, 1] and height in metres.
       action: the gripper is its own mirror image, a grasp turned by half a turn the same grasp, so the `compact`
         network is asked for half of the rotations; and a grasp centred on empty table scores nothing. Not so a push.
       squash: from the network's outputs to scores.
 
     Returns:
-      Scores `[16, 224, 224]` in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
+      Scores in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
     """
     if network.config.preset == "compact":
         turns = ROTATIONS // 2 if action == "grasp" else ROTATIONS
@@ -151,8 +152,8 @@ def score_image(
     return jnp.where(image[..., 3] > fingers.EMPTY_HEIGHT, scores, 0.0) if action == "grasp" else scores
 
 
-def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
-    """The least of what `score_image` says of a grasp and of its mirror images: `[16, 224, 224]`.
+def cautious_scores(network: GraspNet, image: Float[jax.Array, "224 224 4"]) -> Float[jax.Array, "16 224 224"]:
+    """The least of what `score_image` says of a grasp and of its mirror images.
 
     A mirror image of a grasp is as good as the grasp, and both mirrors map the 16 angles onto themselves; so this is
     four answers to one question. The best of a million scores is an overestimate; the least of four makes up for it.
@@ -169,8 +170,10 @@ def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
     return functools.reduce(jnp.minimum, answers) * (1 - fingers.blocked_image(image[..., 3]) / 2)
 
 
-def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:
-    """Logits `[turns, 80, 80, 16]` of the pixels of all cells of the first `turns` turned views, `compact` only.
+def score_cells(
+    network: GraspNet, image: Float[jax.Array, "224 224 4"], turns: int
+) -> Float[jax.Array, "{turns} 80 80 16"]:
+    """Logits of the pixels of all cells of the first `turns` turned views, `compact` only.
 
     Turned and cut into cells by a table that is made once.
     """
@@ -179,18 +182,20 @@ def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:
     return body.cells(flat_pixels(image)[there].reshape(*there.shape[:3], -1))
 
 
-def flat_pixels(image: jax.Array) -> jax.Array:
-    """The normalized pixels of an image `[H, W, 4]` as rows, and one of the table: what `turning_tables` points to."""
+def flat_pixels(image: Float[jax.Array, "H W 4"]) -> Float[jax.Array, "H*W+1 4"]:
+    """The normalized pixels of an image as rows, and one of the table: what `turning_tables` points to."""
     return jnp.concatenate([_normalized(image).reshape(-1, 4), jnp.zeros((1, 4))])
 
 
 @functools.cache
-def turning_tables(turns: int) -> tuple[np.ndarray, np.ndarray]:
+def turning_tables(
+    turns: int,
+) -> tuple[Int[np.ndarray, "{turns} 80 80 16"], Int[np.ndarray, "{turns} 224 224"]]:
     """Where each pixel comes from when the first `turns` rotations are applied, and undone.
 
     Returns:
-      Of each pixel of each cell of the turned views, the pixel of the image `[turns, 80, 80, 16]` (the one past the end
-      is table), and of each pixel of each score map the place in the logits of all cells `[turns, 224, 224]`.
+      Of each pixel of each cell of the turned views, the pixel of the image (the one past the end
+      is table), and of each pixel of each score map the place in the logits of all cells.
     """
     side, cells = WORKSPACE.pixels, VIEW // BLOCK
     with jax.ensure_compile_time_eval():

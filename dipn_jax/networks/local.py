@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.networks.grasp import (
@@ -50,16 +51,18 @@ _WIDER = 2 * (FELT[0] - FELT[1]) // BLOCK
 
 
 @functools.cache
-def _weights() -> np.ndarray:
-    """How much each pixel of each cell `[8, 80, 80, 16]` counts in the mean over all score maps."""
+def _weights() -> Float[np.ndarray, "8 80 80 16"]:
+    """How much each pixel of each cell counts in the mean over all score maps."""
     half = ROTATIONS // 2
     _, back = turning_tables(half)
     count = np.bincount(back.reshape(-1), minlength=half * VIEW**2 + 1)[: half * VIEW**2]
     return (count / back.size).astype(np.float32).reshape(half, _CELLS, _CELLS, BLOCK**2)
 
 
-def _extents(changed: jax.Array, turns: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """Least (column, row) of the pixels `changed [H, W]` in the turned views, and their extent: `[T, 2]` pixels."""
+def _extents(
+    changed: Bool[jax.Array, "H W"], turns: Int[np.ndarray, " T"]
+) -> tuple[Float[jax.Array, "T 2"], Float[jax.Array, "T 2"]]:
+    """Least (column, row) of the pixels `changed` in the turned views, and their extent, in pixels."""
     size, far = changed.shape[0], 1e4
     place = jnp.arange(size) - (size - 1) / 2
     ends = jnp.stack([jnp.where(changed, place, far).min(1), jnp.where(changed, place, -far).max(1)])
@@ -71,19 +74,21 @@ def _extents(changed: jax.Array, turns: np.ndarray) -> tuple[jax.Array, jax.Arra
     return least, jnp.maximum(jnp.where(there, turned, -far).max(1) - least, 0.0)
 
 
-def _felt(cells: jax.Array, least: jax.Array, extent: jax.Array, axis: int) -> jax.Array:
-    """Which columns (axis 0) or rows (axis 1) `cells [T, S]` feel a change."""
+def _felt(
+    cells: Int[jax.Array, "T S"], least: Float[jax.Array, "T 2"], extent: Float[jax.Array, "T 2"], axis: int
+) -> Bool[jax.Array, "T S"]:
+    """Which columns (axis 0) or rows (axis 1) of cells feel a change."""
     low, high = least[:, axis, None] - FELT[axis], least[:, axis, None] + extent[:, axis, None] + FELT[axis]
     return (cells >= low // BLOCK) & (cells <= high // BLOCK)
 
 
-def _scores(logits: jax.Array, height: jax.Array) -> jax.Array:
+def _scores(logits: Float[jax.Array, "*b"], height: Float[jax.Array, "*b"]) -> Float[jax.Array, "*b"]:
     """Scores of pixels of normalized `height`; 0 on the table."""
     return jnp.where(height * SCALE[3] > fingers.EMPTY_HEIGHT, nnx.sigmoid(logits), 0.0)
 
 
-def scores_now(network: GraspNet, now: jax.Array) -> jax.Array:
-    """Scores of the cells of all turned views of an image `[224, 224, 4]`: `[8, 80, 80, 16]`."""
+def scores_now(network: GraspNet, now: Float[jax.Array, "224 224 4"]) -> Float[jax.Array, "8 80 80 16"]:
+    """Scores of the cells of all turned views of an image."""
     half = ROTATIONS // 2
     there, _ = turning_tables(half)
     return _scores(score_cells(network, now, half), flat_pixels(now)[there][..., 3])
@@ -91,21 +96,21 @@ def scores_now(network: GraspNet, now: jax.Array) -> jax.Array:
 
 def rough_means(
     network: GraspNet,
-    now: jax.Array,
-    before: jax.Array,
-    images: jax.Array,
-    wanted: jax.Array,
+    now: Float[jax.Array, "224 224 4"],
+    before: Float[jax.Array, "8 80 80 16"],
+    images: Float[jax.Array, "P 224 224 4"],
+    wanted: Bool[jax.Array, " P"],
     *,
     turns: tuple[int, ...],
-) -> jax.Array:
-    """About what `turns` contribute to the mean of all scores on each image, less what they do now: `[P]`.
+) -> Float[jax.Array, " P"]:
+    """About what `turns` contribute to the mean of all scores on each image, less what they do now.
 
     Args:
       network: GN, `compact`, in evaluation mode.
-      now: `[224, 224, 4]`.
+      now: the present image.
       before: of `scores_now`.
-      images: `[P, 224, 224, 4]`.
-      wanted: `[P]` bool; others get 0.
+      images: the others.
+      wanted: which of them; others get 0.
       turns: rotations, of the first eight.
     """
     which = np.array(turns)
@@ -141,17 +146,22 @@ def rough_means(
     return jax.lax.map(one, (images, wanted))
 
 
-def appraise(network: GraspNet, now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+def appraise(
+    network: GraspNet,
+    now: Float[jax.Array, "224 224 4"],
+    images: Float[jax.Array, "P 224 224 4"],
+    wanted: Bool[jax.Array, " P"],
+) -> tuple[Float[jax.Array, " P+1"], Float[jax.Array, " P+1"]]:
     """Mean and highest of all scores on each image; see `planner.Appraiser`.
 
     Args:
       network: GN, `compact`, in evaluation mode.
-      now: `[224, 224, 4]`.
-      images: `[P, 224, 224, 4]`.
-      wanted: `[P]` bool.
+      now: the present image.
+      images: the others.
+      wanted: which of them.
 
     Returns:
-      `[1 + P]` each, of `now` first; as whole images give them for the FINALISTS best (for all if no more than FEW are
+      Of each image, of `now` first; as whole images give them for the FINALISTS best (for all if no more than FEW are
       wanted), the least of theirs for others.
     """
     count = len(wanted)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import mujoco
@@ -18,6 +18,7 @@ _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS"
 _FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}FULL")) for name in ("CONTACT", "CNSTR")]
 
 
+@runtime_checkable
 class Worlds(Protocol):
     """A batch of simulations of the gripper and N objects."""
 
@@ -56,7 +57,7 @@ def follow(
     fence: float,
 ) -> Rollout:
     """Run `sims` along `trajectories`; arguments as `Engine.simulate`, but for `scenes` and `slots`, from `pack`."""
-    present = scenes.shape >= 0
+    present = np.asarray(scenes.shape >= 0)
     mass = np.where(present, scenes.mass, 0.0)
     ticks = np.round(samples / physics.CONTROL_PERIOD).astype(int)
     last = int(ticks[-1])
@@ -112,7 +113,7 @@ class Watch:
         present = self.scenes.shape >= 0
         finite = np.isfinite(self.fastest)
         stray = self.off.max(-1)
-        return faults.codes(
+        codes = faults.codes(
             self.scenes,
             qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7),
             self.velocity(),
@@ -127,6 +128,7 @@ class Watch:
             settle=settle,
             xp=np,
         )
+        return np.asarray(codes)
 
 
 def pack(scenes: Scene, poses: np.ndarray) -> tuple[Scene, np.ndarray]:

@@ -46,7 +46,7 @@ def hold_in(mass: jax.Array, state: State) -> jax.Array:
 def control(trajectories: Trajectory, time: Array | float) -> jax.Array:
     """Actuator set points `[B, 6]` at `time`: linear between key frames, gap split over both fingers."""
 
-    def one(times: jax.Array, targets: jax.Array) -> jax.Array:
+    def one(times: Array, targets: Array) -> jax.Array:
         index = jnp.clip((times <= time).sum() - 1, 0, len(times) - 2)
         span = jnp.maximum(times[index + 1] - times[index], 1e-9)
         weight = jnp.clip((time - times[index]) / span, 0.0, 1.0)

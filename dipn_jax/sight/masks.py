@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
+from dipn_jax.structs import Array
 from dipn_jax.workspace import WORKSPACE
 
 
-def mask_centers(label: jax.Array, slots: int) -> tuple[jax.Array, jax.Array]:
+def mask_centers(
+    label: Int[Array, "H W"], slots: int
+) -> tuple[Float[jax.Array, "{slots} 2"], Float[jax.Array, " {slots}"]]:
     """Centroids of the visible masks.
 
     Args:
-      label: `[H, W]` int32 object slots, ABSENT on the table.
-      slots: N.
+      label: object slots, ABSENT on the table.
+      slots: number of object slots.
 
     Returns:
-      Centroid `[N, 2]` in metres (workspace, of a map centred on it) and size `[N]` in pixels; the
-      centroid of an object out of sight is 0.
+      Centroids in metres (workspace, of a map centred on it) and sizes in pixels; the centroid of an
+      object out of sight is 0.
     """
     h, w = label.shape
     hot = label == jnp.arange(slots)[:, None, None]
@@ -31,8 +35,8 @@ def mask_centers(label: jax.Array, slots: int) -> tuple[jax.Array, jax.Array]:
     return total / jnp.maximum(area, 1.0)[:, None], area
 
 
-def contour(foreground: jax.Array) -> jax.Array:
-    """Foreground pixels `[H, W]` bool with a neighbour (of eight) on the table or outside the map."""
+def contour(foreground: Bool[Array, "H W"]) -> Bool[Array, "H W"]:
+    """Foreground pixels with a neighbour (of eight) on the table or outside the map."""
     padded = jnp.pad(foreground, 1)
     across = padded[:, :-2] & padded[:, 1:-1] & padded[:, 2:]
     return foreground & ~(across[:-2] & across[1:-1] & across[2:])
