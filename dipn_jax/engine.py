@@ -6,7 +6,7 @@ The engines themselves are in `dipn_jax.physics`; whoever simulates is handed on
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol
 
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
@@ -34,7 +34,6 @@ class PhysicsConfig:
         return tuple(-1 if cap is None else max(cap[0], cap[1] * slots) for cap in given)  # type: ignore[return-value]
 
 
-@runtime_checkable
 class Engine(Protocol):
     """Simulates batches of independent scenes.
 

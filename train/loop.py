@@ -8,7 +8,7 @@ import json
 import logging
 import pathlib
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -38,7 +38,6 @@ class TrainConfig:
     save_every: int = 200
 
 
-@runtime_checkable
 class Taught(Protocol):
     """What an optimizer step needs of a task."""
 
@@ -47,7 +46,6 @@ class Taught(Protocol):
         ...
 
 
-@runtime_checkable
 class Task(Taught, Protocol):
     """Something to learn: data, a loss and a measure."""
 

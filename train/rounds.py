@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar
 
 from flax import nnx
 
@@ -12,7 +12,6 @@ from dipn_jax import console, files
 from dipn_jax.storage import checkpoint, resume
 
 
-@runtime_checkable
 class State(Protocol):
     """Everything that a run is at a moment; it pickles."""
 

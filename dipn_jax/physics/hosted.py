@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import jax
 import mujoco
@@ -18,7 +18,6 @@ _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS"
 _FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}FULL")) for name in ("CONTACT", "CNSTR")]
 
 
-@runtime_checkable
 class Worlds(Protocol):
     """A batch of simulations of the gripper and N objects."""
 

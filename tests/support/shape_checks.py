@@ -1,13 +1,12 @@
-"""The type checker that the import hook puts on every function of the library in tests: beartype, and structs.
+"""The type checker that the import hook puts on every function of the library in tests: beartype, for shapes alone.
 
-Four things that beartype alone does not do:
+Only annotations that say a shape are looked at (`Float[Array, "N 3"]`, or a struct that has such fields); what else a
+function is given, the tests of its errors decide. Two things that beartype alone does not do:
 
 - an axis of a field is the same as the axis of that name in the other arguments: a scene of five objects with poses of
   six is an error. Leading batch axes (`*b`) belong to one struct;
 - JAX rebuilds structs around leaves that are not arrays (`None`, `object()`, shapes, axes of `vmap`), so a field is
-  checked only where it holds an array;
-- a number of NumPy does where a Python number is wanted, and an `int` where a `float` is;
-- an array without a shape may be one of JAX or of NumPy, and an `Array` a number.
+  checked only where it holds an array.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import inspect
 import operator
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import beartype
@@ -27,20 +26,6 @@ import jaxtyping
 import numpy as np
 
 ARRAYS = (jax.Array, np.ndarray, np.generic)
-
-
-class _Any(type):
-    def __instancecheck__(cls, value: object) -> bool:
-        return isinstance(value, ARRAYS)
-
-
-class AnyArray(metaclass=_Any):
-    """An array of JAX or of NumPy."""
-
-
-WIDER = {bool: bool | np.bool_, int: int | np.integer, float: float | int | np.floating | np.integer}
-WIDER |= {jax.Array: AnyArray, np.ndarray: AnyArray}
-_beartype = beartype.beartype(conf=beartype.BeartypeConf(hint_overrides=beartype.BeartypeHintOverrides(WIDER)))
 
 
 class _Other(type):
@@ -53,30 +38,26 @@ class NoArray(metaclass=_Other):
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` with its arguments and its result checked on every call."""
+    """`function` with the shapes of its arguments and of its result checked on every call."""
     hints = function.__annotations__
-    hints = {name: Any if set(_parts(hint)) == set(ARRAYS) else hint for name, hint in hints.items()}
+    structs = [name for name, hint in hints.items() if _is_struct(hint) and name != "return"]
+    shaped = {name: hint for name, hint in hints.items() if _says_shape(hint)}
     if function.__name__ == "__init__":
-        function.__annotations__ = {k: hint | NoArray if _is_shaped(hint) else hint for k, hint in hints.items()}
-        return _beartype(function)
-    function.__annotations__ = hints
-    checked = _beartype(function)
-    structs = {name for name, hint in hints.items() if _is_struct(hint)}
-    if not structs:
-        return checked
+        shaped, structs = {name: hint | NoArray for name, hint in shaped.items()}, []
+    if not shaped and not structs:
+        return function
+    function.__annotations__ = {name: shaped.get(name, Any) for name in hints}
+    checked = beartype.beartype(function)
     signature = inspect.signature(function)
 
     @functools.wraps(function)
     def with_fields(*args: Any, **kwargs: Any) -> Any:
         arguments = signature.bind(*args, **kwargs).arguments
-        for name in structs & set(arguments):
-            _check_fields(arguments[name], name)
-        result = checked(*args, **kwargs)
-        if "return" in structs:
-            _check_fields(result, "return")
-        return result
+        for name in structs:
+            _check_fields(arguments.get(name), name)
+        return checked(*args, **kwargs)
 
-    return with_fields
+    return with_fields if structs else checked
 
 
 def _check_fields(struct: Any, place: str) -> None:
@@ -86,8 +67,8 @@ def _check_fields(struct: Any, place: str) -> None:
     for name, hint in _fields(type(struct)):
         value, where = getattr(struct, name), f"{place}.{name}"
         _check_fields(value, where)
-        if isinstance(value, ARRAYS) and not any(isinstance(value, part) for part in _parts(hint)):
-            raise TypeError(f"{where} {value.dtype}{list(value.shape)}: want {_text(hint)}")
+        if isinstance(value, ARRAYS) and _says_shape(hint) and not any(isinstance(value, p) for p in _parts(hint)):
+            raise TypeError(f"{where} {value.dtype}{list(value.shape)}: want {hint}")
 
 
 @functools.cache
@@ -98,15 +79,14 @@ def _fields(struct: type) -> list[tuple[str, Any]]:
 
 
 def _without_batch(hint: Any) -> Any:
-    parts = [
-        part.dtype[part.array_type, part.dim_str.replace("*b", "...")] if _is_array(part) else part
-        for part in _parts(hint)
-    ]
+    if not _says_shape(hint):
+        return hint
+    parts = [p.dtype[p.array_type, p.dim_str.replace("*b", "...")] if _is_array(p) else p for p in _parts(hint)]
     return functools.reduce(operator.or_, parts)
 
 
-def _parts(hint: Any) -> Iterator[Any]:
-    yield from typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+def _parts(hint: Any) -> tuple[Any, ...]:
+    return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
 
 
 def _is_array(hint: Any) -> bool:
@@ -117,9 +97,6 @@ def _is_struct(hint: Any) -> bool:
     return isinstance(hint, type) and hasattr(hint, "_flax_dataclass")
 
 
-def _is_shaped(hint: Any) -> bool:
-    return _is_struct(hint) or any(_is_array(part) or part in ARRAYS for part in _parts(hint))
-
-
-def _text(hint: Any) -> str:
-    return " or ".join(f"{p.dtype.__name__}[{p.dim_str}]" if _is_array(p) else str(p) for p in _parts(hint))
+def _says_shape(hint: Any) -> bool:
+    """Whether there is an array of a given shape anywhere in a type."""
+    return _is_array(hint) or any(_says_shape(part) for part in typing.get_args(hint))
