@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax.structs import Array, Fault, Scene
 from dipn_jax.workspace import WORKSPACE
@@ -33,18 +34,18 @@ top of an object.
 """
 
 
-def speed(scenes: Scene, velocity: Array, *, xp: ModuleType = jnp) -> Array:
-    """Speed `[B, N]` (m/s) of the centres of objects with `velocity [B, N, 6]`; empty slots have none."""
+def speed(scenes: Scene, velocity: Float[Array, "B N 6"], *, xp: ModuleType = jnp) -> Float[Array, "B N"]:
+    """Speed (m/s) of the centres of objects; empty slots have none."""
     return xp.where(scenes.shape >= 0, xp.sqrt((velocity[..., :3] ** 2).sum(-1)), 0.0)
 
 
-def off_path(hand: Array, target: Array, *, xp: ModuleType = jnp) -> Array:
-    """Largest difference `[B]` (metres, along an axis) of where the hand is and should be, `[B, 3]` each."""
+def off_path(hand: Float[Array, "B 3"], target: Float[Array, "B 3"], *, xp: ModuleType = jnp) -> Float[Array, " B"]:
+    """Largest difference (metres, along an axis) of where the hand is and should be."""
     return xp.abs(hand - target).max(-1)
 
 
-def _fastest(scenes: Scene, velocity: Array, xp: ModuleType) -> Array:
-    """Speed `[B]` (m/s) of the fastest point of any object, at most."""
+def _fastest(scenes: Scene, velocity: Float[Array, "B N 6"], xp: ModuleType) -> Float[Array, " B"]:
+    """Speed (m/s) of the fastest point of any object, at most."""
     radius = xp.linalg.norm(scenes.size, axis=-1) / 2
     spin = xp.where(scenes.shape >= 0, xp.linalg.norm(velocity[..., 3:], axis=-1) * radius, 0.0)
     return xp.maximum(speed(scenes, velocity, xp=xp), spin).max(-1)
@@ -52,39 +53,39 @@ def _fastest(scenes: Scene, velocity: Array, xp: ModuleType) -> Array:
 
 def codes(
     scenes: Scene,
-    position: Array,
-    velocity: Array,
-    hand: Array,
-    target: Array,
+    position: Float[Array, "B N 7"],
+    velocity: Float[Array, "B N 6"],
+    hand: Float[Array, "B 3"],
+    target: Float[Array, "B 3"],
     *,
-    top: Array,
-    stray: Array,
-    broken: Array,
-    full: Array,
-    depth: Array,
-    deepest: Array,
-    settle: Array | bool,
+    top: Float[Array, " B"],
+    stray: Float[Array, " B"],
+    broken: Bool[Array, " B"],
+    full: Bool[Array, " B"],
+    depth: Float[Array, " B"],
+    deepest: Float[Array, " B"],
+    settle: Bool[Array, ""] | bool,
     xp: ModuleType = jnp,
-) -> Array:
+) -> Int[Array, " B"]:
     """Fault codes at the end of a rollout.
 
     Args:
-      scenes: `[B, N]`.
-      position: `[B, N, 7]` poses, metres.
-      velocity: `[B, N, 6]` linear and angular.
-      hand: `[B, 3]` metres: where the hand is.
-      target: `[B, 3]` metres: where it should be.
-      top: `[B]` m/s: highest speed of a centre on the way.
-      stray: `[B]` metres: farthest that the hand was off its path on the way.
-      broken: `[B]` bool: something was not finite on the way.
-      full: `[B]` bool: contacts, or pairs of geoms, were left out on the way.
-      depth: `[B]` metres: deepest contact now.
-      deepest: `[B]` metres: deepest contact on the way, after GRACE and while no fence was up.
+      scenes: B scenes.
+      position: poses, metres and quaternions wxyz.
+      velocity: linear and angular.
+      hand: metres: where the hand is.
+      target: metres: where it should be.
+      top: m/s: highest speed of a centre on the way.
+      stray: metres: farthest that the hand was off its path on the way.
+      broken: something was not finite on the way.
+      full: contacts, or pairs of geoms, were left out on the way.
+      depth: metres: deepest contact now.
+      deepest: metres: deepest contact on the way, after GRACE and while no fence was up.
       settle: whether everything has to be at rest.
       xp: numpy or jax.numpy.
 
     Returns:
-      `[B]` int32, bits of `Fault`.
+      Bits of `Fault`.
     """
     present = scenes.shape >= 0
     outside = (xp.abs(position[..., :2]) > WORKSPACE.half).any(-1) & present

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Float
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 from mujoco.mjx._src.types import GeomType
@@ -79,9 +80,9 @@ class MjxEngine:
     def simulate(
         self,
         scenes: Scene,
-        poses: Array,
+        poses: Float[Array, "B N 7"],
         trajectories: Trajectory,
-        samples: Array,
+        samples: Float[Array, " S"],
         *,
         settle: bool = False,
         fence: float = 0.0,

@@ -40,7 +40,7 @@ class NoArray(metaclass=_Other):
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` with the shapes of its arguments and of its result checked on every call."""
     hints = function.__annotations__
-    structs = [name for name, hint in hints.items() if _is_struct(hint) and name != "return"]
+    structs = [name for name, hint in hints.items() if name != "return" and any(map(_is_struct, _parts(hint)))]
     shaped = {name: hint for name, hint in hints.items() if _says_shape(hint)}
     if function.__name__ == "__init__":
         shaped, structs = {name: hint | NoArray for name, hint in shaped.items()}, []
