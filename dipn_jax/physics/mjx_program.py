@@ -100,7 +100,7 @@ class Program:
         kept = jnp.where(present[:, None, :, None], record.poses, poses[:, None])
         return Rollout(kept, record.gripper, fault)
 
-    def _fault(self, scenes: Scene, state: State, record: Record, target: jax.Array, settle: jax.Array) -> jax.Array:
+    def _fault(self, scenes: Scene, state: State, record: Record, target: jax.Array, settle: jax.Array) -> Array:
         """Return fault codes `[B]` at the end of a rollout, where the gripper should be at `target [B, 6]`."""
         return faults.codes(
             scenes,
