@@ -1,4 +1,4 @@
-"""`python -m experiments.tutorial_pictures`: the pictures of docs/tutorial.md, made by running the Python of that page."""
+"""The pictures of docs/tutorial.md, made by running that page's Python: `python -m experiments.tutorial_pictures`."""
 
 from __future__ import annotations
 
