@@ -39,6 +39,9 @@ BENCHMARKS = {
     "compile.warm_over_cold": Benchmark(
         "first calls with a warm compilation cache over a cold one", "<= 0.3", "compilation:warm_over_cold"
     ),
+    "cli.help_vs_jax": Benchmark(
+        "seconds of the slowest --help over those of import jax, and seconds", "<= 0.5", "commands:help_vs_jax"
+    ),
     "push_net.vs_torch": Benchmark(
         "training samples a second of both DIPNs over the same in PyTorch, and memory", ">= 1", "push_net:vs_torch"
     ),

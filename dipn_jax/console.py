@@ -243,4 +243,5 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
         for name, command in commands.items()
     )
     one_of_them: Any = Union[choices]  # noqa: UP007  a tuple
-    tyro.cli(one_of_them, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,))
+    program = pathlib.Path(sys.argv[0]).name
+    tyro.cli(one_of_them, prog=program, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,))

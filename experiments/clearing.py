@@ -22,6 +22,8 @@ from experiments import command, grasping, pages, push_prediction
 from experiments.runs import Part, Recipe, Run
 
 HARD = "--cases hard --instances 30"
+"""Options for the ten hard cases, 30 times each."""
+
 TABLES = {
     "hard": HARD,
     "30": "--cases random --objects 30 --instances 30",
@@ -33,6 +35,7 @@ FEWER_TABLES = {"hard": HARD, "30": "--cases random --objects 30 --instances 10"
 """Tables of the methods with more samples."""
 
 BUILTIN = "--push-net builtin --grasp-net builtin"
+"""Options for the networks that come with the package."""
 
 
 def list_runs(root: pathlib.Path) -> list[Run]:
@@ -102,6 +105,7 @@ TITLES = {
     "efficiency_completed": "efficiency, completed",
     "efficiency_all": "all",
 }
+"""Measures of the tables, and their titles."""
 
 
 def _cell(values: dict[str, Any], at: str) -> str:

@@ -89,12 +89,17 @@ def _without_arches(run: Recipe) -> None:
 
 
 COUNTS = (50, 100, 200, 300, 400)
+"""Grasps of the columns of the table of learning while grasping."""
+
 ROWS = {
     "builtin-10": "10 objects",
     "builtin-30": "30 objects",
     "unseen-concave": "10 arches, never trained on",
 }
+"""Evaluations of the table of success, and their titles."""
+
 RATES = {"gn": "GN, until the table is empty", "gn_first": "GN, first grasp", "random_foreground": "random foreground"}
+"""Rates of success of that table, and their titles."""
 
 
 def success_table(values: dict[str, Any]) -> str:

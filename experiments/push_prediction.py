@@ -2,8 +2,8 @@
 
     python -m experiments.push_prediction          # or make push-figures
 
-Hours on 2 cores, most of them for 52,000 pushes and three trainings on 51,000 of them. It can be interrupted; the same
-command continues. The network that comes with the package is the run `runs/51000-0`, exported:
+Hours on 2 cores. It can be interrupted; the same command continues. The network that comes with the package is the run
+`runs/51000-0`, exported:
 
     dipn-train export --run results/push/runs/51000-0 --out dipn_jax/data/dipn
 """
@@ -27,8 +27,10 @@ STEPS = {100: 600, 300: 1000, 500: 1500, 1000: 2500, 1500: 3000, 51000: 10000}
 """Optimizer steps of the learning curve, by number of pushes learnt from."""
 
 TRAIN = "dipn-train push --eval-every 1000 --save-every 1000 --data"
+"""Begins a training; a folder of pushes follows."""
+
 TRAIN_1500 = "dipn-train push --eval-every 1000 --save-every 1000 --limit 1500 --steps 3000 --data"
-"""Followed by a folder of pushes."""
+"""Begins a training on 1,500 pushes; a folder of pushes follows."""
 
 ITEMS = {
     "cuboid": "cuboid_half cuboid_flat cuboid_long cube cuboid_mid cuboid_square",
@@ -97,11 +99,14 @@ SHIFTS = {
     "shift-stickier": "friction 0.5 to 0.7",
     "shift-crowded": "8 to 15 objects (1 to 7)",
 }
+"""What is different in the scenes of each such run (and what the network was trained on)."""
+
 COLUMNS = [(f"{c}cm", which) for c in curves.DISTANCES for which in ("all", "moved")]
+"""Distance and objects of each column of errors."""
 
 
 def shift_table(values: dict[str, Any]) -> str:
-    """Builtin network, floor and better baseline where the world is not what the network learnt from."""
+    """The shipped network, the floor and the better baseline in worlds that differ from that of the training data."""
     titles = [f"{at}, {which}" for at, which in COLUMNS]
     lines = ["| scenes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
     for shift, title in SHIFTS.items():
@@ -114,7 +119,7 @@ def shift_table(values: dict[str, Any]) -> str:
 
 
 def alone_table(values: dict[str, Any]) -> str:
-    """One network for every distance against one for each, and one taught by found masks; 1,500 pushes, seed 0."""
+    """One network for every distance, one for each, and one trained on found masks; 1,500 pushes, seed 0."""
     names = {"every": "one network for 1 to 10 cm", "only5": "trained for 5 cm", "only10": "trained for 10 cm"}
     names["found"] = "1 to 10 cm, trained on masks found in the image"
     columns = [(f"push_error{masks}", at, which) for masks in ("", "_segmented") for at, which in COLUMNS]
@@ -130,7 +135,7 @@ def alone_table(values: dict[str, Any]) -> str:
 
 
 def unseen_table(values: dict[str, Any]) -> str:
-    """Scenes of one class of shapes only: a network never shown that class, and one shown all; 1,500 pushes each."""
+    """Scenes of one class of shapes only: a network trained without it, and one with all; 1,500 pushes each."""
     titles = [f"{at}, {which}" for at, which in COLUMNS]
     lines = ["| shapes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
     predictors = {
@@ -179,6 +184,7 @@ GOALS = [
         (0.35, 0.40),
     ),
 ]
+"""Of each row: title, key, whether it is divided by the better baseline, and goals at 5 and 10 cm."""
 
 
 def goal_table(values: dict[str, Any]) -> str:

@@ -109,12 +109,12 @@ def select(listed: Sequence[Run], only: Sequence[str]) -> list[Run]:
     names = {run.name: run for run in listed}
     if unknown := [name for name in only if name not in names]:
         raise UserError(f"--only {unknown[0]}: no such run; --list shows their names")
-    wanted, open_ = set[str](), list(only or names)
-    while open_:
-        name = open_.pop()
+    wanted, waiting = set[str](), list(only or names)
+    while waiting:
+        name = waiting.pop()
         if name not in wanted:
             wanted.add(name)
-            open_ += [other.name for other in needs(names[name], listed)]
+            waiting += [other.name for other in needs(names[name], listed)]
     return [run for run in listed if run.name in wanted]
 
 

@@ -1,5 +1,6 @@
 """Bad input at the command line: one line on standard error, exit code 2, nothing half-written."""
 
+import inspect
 import os
 import pathlib
 import shutil
@@ -125,14 +126,47 @@ def test_an_option_that_does_not_exist_exits_with_2(call) -> None:
     assert stop.value.code == 2
 
 
+def _help(stage: str, *command: str, capfd: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stop:
+        console.run("test", COMMANDS[stage], [*command, "--help"])
+    assert stop.value.code == 0
+    return capfd.readouterr().out
+
+
 @pytest.mark.parametrize("stage", COMMANDS)
 def test_help_teaches(stage: str, capfd: pytest.CaptureFixture[str]) -> None:
-    for name in COMMANDS[stage]:
-        with pytest.raises(SystemExit) as stop:
-            console.run("test", COMMANDS[stage], [name, "--help"])
-        assert stop.value.code == 0
-        text = capfd.readouterr().out
+    for name, command in COMMANDS[stage].items():
+        text = _help(stage, name, capfd=capfd)
         assert len(text) > 300 or name in ("verify", "repair", "info")
+        examples = [line for line in inspect.getdoc(command).splitlines() if line.startswith(f"  dipn-{stage} ")]
+        assert examples or name in ("verify", "repair", "info")
+        shown = text.splitlines()
+        for example in examples:
+            assert example in shown, f"{name}: an example does not stand on a line of its own"
+        for line in shown:
+            assert "dipn-" not in line or line.count(f"  dipn-{stage} ") <= 1, line
+
+
+@pytest.mark.parametrize("stage", COMMANDS)
+def test_the_list_of_commands_has_a_sentence_for_each(stage: str, capfd: pytest.CaptureFixture[str]) -> None:
+    text = " ".join(_help(stage, capfd=capfd).replace("│", " ").split())
+    for command in COMMANDS[stage].values():
+        assert inspect.getdoc(command).splitlines()[0] in text
+    assert f"dipn-{stage} " not in text, "examples belong to the help of each command"
+
+
+@pytest.mark.parametrize("stage", COMMANDS)
+def test_help_imports_nothing_that_is_slow(stage: str) -> None:
+    script = (
+        f"import sys; from dipn_jax.{stage}.cli import COMMANDS; from dipn_jax import console\n"
+        "for arguments in [['--help'], *[[name, '--help'] for name in COMMANDS]]:\n"
+        "    try: console.run('test', COMMANDS, arguments)\n"
+        "    except SystemExit: pass\n"
+        "slow = {'jax', 'jaxlib', 'flax', 'mujoco', 'numpy', 'matplotlib', 'pyarrow', 'orbax', 'cv2'}\n"
+        "sys.exit(' '.join(slow & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_reader_that_has_seen_enough_is_no_mistake() -> None:

@@ -88,7 +88,7 @@ def clear(
         released=released,
         cautious=cautious,
     )
-    _check(out, seed, config)
+    _check(out, seed, config, tables)
     networks, physics = Networks(push_net, grasp_net, value_net), make_engine(engine)
     (decide,) = on_tables.load(method, networks, physics, [config])
     longest, runs = max(distance, SIMULATED_PUSH), networks.runs(method)
@@ -102,8 +102,8 @@ def _settings(given: dict[str, Any]) -> dict[str, Any]:
     return others | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
 
 
-def _check(out: pathlib.Path, seed: int, config: PolicyConfig) -> None:
-    """Refuse options that make no sense."""
+def _check(out: pathlib.Path, seed: int, config: PolicyConfig, tables: Tables) -> None:
+    """Refuse options that make no sense, and a case file that cannot be used."""
     from dipn_jax.planning.methods import LONGEST_PUSH
 
     options.check(out, seed, candidates=config.candidates)
@@ -111,6 +111,7 @@ def _check(out: pathlib.Path, seed: int, config: PolicyConfig) -> None:
     for distance in config.distances:
         console.require_between(0.01, LONGEST_PUSH, distance=distance)
     console.require_between(0.0, 10.0, gamma=config.gamma, threshold=config.grasp_above)
+    tables.slots()  # reads the case file
 
 
 def sweep(
@@ -157,7 +158,7 @@ def sweep(
     if candidates < len(every):
         raise UserError(f"--candidates {candidates}: want at least one for each of the {len(every)} distances")
     chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold)
-    _check(out, seed, chosen)
+    _check(out, seed, chosen, tables)
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
     configs[sweeping.CHOSEN] = chosen
     networks, physics = Networks(push_net, grasp_net), make_engine(engine)
