@@ -6,13 +6,15 @@ import tempfile
 
 from dipn_jax.datagen import cli as datagen
 from dipn_jax.train import cli as train
+from dipn_jax.train.configs import TrainConfig
 
 import dipn_jax
 from dipn_jax.planning import predictors
 
 folder = pathlib.Path(tempfile.mkdtemp())
 datagen.push(folder / "data", episodes=40, objects="3", actions=4, shard_size=40)
-train.push(folder / "data", folder / "run", steps=30, batch=16, eval_every=10, save_every=30)
+schedule = TrainConfig(steps=30, batch=16, learning_rate=3e-3, eval_every=10, save_every=30)
+train.push(folder / "data", folder / "run", config=schedule)
 
 # the run holds its learning curve, and checkpoints that are read like those that come with the package
 lines = (folder / "run" / "metrics.jsonl").read_text().splitlines()

@@ -17,7 +17,7 @@ from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig
 from dipn_jax.physics import colliders, faults, prisms, recording
 from dipn_jax.physics.recording import Record, State
-from dipn_jax.structs import Rollout, Scene, Trajectory
+from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import model, shapes
 from dipn_jax.world.model import GRIPPER_DOF

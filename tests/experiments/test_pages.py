@@ -1,7 +1,6 @@
 """The pages of results show the figures in docs, and are written from results of runs."""
 
 import pathlib
-import re
 import shutil
 from types import ModuleType
 from typing import Any
@@ -26,12 +25,6 @@ def test_the_pages_in_docs_show_the_figures_in_docs(name: str) -> None:
     for table in tables:
         assert table in text and pages.with_table(text, table) == text
     assert pages.with_box(text, pages.box(values)) == text
-
-
-def test_rows_of_the_readme_are_those_of_the_page() -> None:
-    page, readme = (DOCS / "clearing.md").read_text(), (DOCS.parent / "README.md").read_text()
-    for row in re.findall(r"^\| [a-z+]+, (?:large|paper|unguarded) \|.*$", readme, re.MULTILINE):
-        assert f"{row}\n" in page
 
 
 FACTS = {
