@@ -13,12 +13,12 @@ import numpy as np
 
 from benchmarks.harness import Setting, Skipped, alternate
 from benchmarks.worker import Worker, versus
-from dipn_jax.networks.grasp import VIEW
+from dipn_jax.networks.grasp import VIEW_PIXELS
 from dipn_jax.physics import make_engine
 from dipn_jax.sight import render
 from dipn_jax.world import clutter, scenes
 
-BATCHES = {"compact": (32, 112), "paper": (2, VIEW)}
+BATCHES = {"compact": (32, 112), "paper": (2, VIEW_PIXELS)}
 """Examples a training step, and pixels a side of each."""
 OBJECTS = 10
 

@@ -17,7 +17,7 @@ from flax import nnx
 from benchmarks.harness import Setting, alternate, quiet, seconds
 from dipn_jax import geometry, structs
 from dipn_jax.networks.dipn import DipnConfig
-from dipn_jax.networks.grasp import VIEW, GraspConfig
+from dipn_jax.networks.grasp import VIEW_PIXELS, GraspConfig
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import candidates, methods, planner, predictors, scorers
 from dipn_jax.sight import imagine, masks, render
@@ -116,7 +116,7 @@ def _paper_one_by_one(seen: Observation, count: int) -> float:
     @jax.jit
     def rotation(image: jax.Array, angle: jax.Array) -> jax.Array:
         table = jnp.array([*render.TABLE_COLOR, 0.0])
-        view = geometry.rotate_map(image - table, angle, VIEW) + table
+        view = geometry.rotate_map(image - table, angle, VIEW_PIXELS) + table
         score = nnx.sigmoid(nnx.merge(graph, state)(view[None]))[0]
         return geometry.unrotate_map(score, angle, image.shape[0]).mean()
 

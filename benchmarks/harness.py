@@ -9,7 +9,6 @@ import io
 import pathlib
 import platform
 import statistics
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +17,7 @@ from typing import Any, Literal
 from dipn_jax.datagen import generate
 
 from dipn_jax import files
-from dipn_jax.physics import cores
+from dipn_jax.machine import commit, cores, processor
 
 Figures = dict[str, float]
 Scale = Literal["small", "full"]
@@ -97,26 +96,10 @@ def machine() -> dict[str, Any]:
     import jax
 
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": cores(),
         "devices": [device.device_kind for device in jax.local_devices()],
         "python": platform.python_version(),
         "versions": files.package_versions(),
-        "commit": _commit(),
+        "commit": commit(),
     }
-
-
-def _processor() -> str:
-    info = pathlib.Path("/proc/cpuinfo")
-    rows = info.read_text().splitlines() if info.exists() else []
-    names = (row.partition(":")[2].strip() for row in rows if row.startswith("model name"))
-    return next(names, platform.processor() or platform.machine())
-
-
-def _commit() -> str:
-    """Commit of the sources, marked where files differ from it."""
-    command = ["git", "-C", str(pathlib.Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"

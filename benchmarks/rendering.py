@@ -19,7 +19,7 @@ from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import clutter, model, scenes
 
 OBJECTS, BATCH = 10, 16
-CAMERA = 1.0
+CAMERA_HEIGHT = 1.0
 """Metres above the table from which rays start."""
 AWAY = 3.0
 """Metres above the table to which the gripper is lifted out of the view."""
@@ -46,7 +46,7 @@ class RayCaster:
         self.slot = models[0].geom_bodyid - models[0].body("o0").id  # of each geom; negative: no object
         at = (np.arange(WORKSPACE.pixels) - (WORKSPACE.pixels - 1) / 2) * WORKSPACE.pixel
         x, y = np.meshgrid(at, at)
-        self.origin = np.stack([x, y, np.full_like(x, CAMERA)], -1).reshape(-1, 3)
+        self.origin = np.stack([x, y, np.full_like(x, CAMERA_HEIGHT)], -1).reshape(-1, 3)
         table = np.broadcast_to(render.TABLE_COLOR, (len(models), 1, 3))
         self.palette = np.concatenate([np.asarray(items.scene.color), table], 1)
 
@@ -56,7 +56,7 @@ class RayCaster:
         distance, geom = self.sims.ray(self.origin, np.array([0.0, 0.0, -1.0]))
         slot = np.where(geom < 0, ABSENT, self.slot[geom])
         label = np.where(slot < 0, ABSENT, slot).reshape(-1, side, side)
-        height = np.where(label < 0, 0.0, CAMERA - distance.reshape(label.shape))
+        height = np.where(label < 0, 0.0, CAMERA_HEIGHT - distance.reshape(label.shape))
         color = self.palette[np.arange(len(label))[:, None, None], label]  # ABSENT is the last: the table
         slots = self.palette.shape[1] - 1
         return Observation(height.astype(np.float32), color.astype(np.float32), label.astype(np.int32), slots)

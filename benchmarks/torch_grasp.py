@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.torch_push import Bottleneck
-from dipn_jax.networks.grasp import BLOCK, VIEW, GraspConfig
+from dipn_jax.networks.grasp import CELL_PIXELS, VIEW_PIXELS, GraspConfig
 from dipn_jax.workspace import ROTATIONS, WORKSPACE, grasp_angles
 
 
@@ -69,18 +69,18 @@ class Compact(nn.Module):
     def __init__(self, config: GraspConfig) -> None:
         super().__init__()
         fine, coarse = config.width, config.coarse
-        self.stem = nn.Conv2d(4 * BLOCK**2, fine, 3, 1, 1)
+        self.stem = nn.Conv2d(4 * CELL_PIXELS**2, fine, 3, 1, 1)
         self.down = nn.Conv2d(fine, coarse, 3, 2, 1)
         self.blocks = nn.Sequential(*[Residual(coarse) for _ in range(config.blocks)])
         self.up = nn.Conv2d(coarse, 4 * fine, 1)
-        self.head, self.out = nn.Conv2d(fine, 2 * fine, 3, 1, 1), nn.Conv2d(2 * fine, BLOCK**2, 1)
+        self.head, self.out = nn.Conv2d(fine, 2 * fine, 3, 1, 1), nn.Conv2d(2 * fine, CELL_PIXELS**2, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Logits `[B, H, W]` of images `[B, 4, H, W]`."""
-        fine = functional.relu(self.stem(functional.pixel_unshuffle(x, BLOCK)))
+        fine = functional.relu(self.stem(functional.pixel_unshuffle(x, CELL_PIXELS)))
         coarse = self.blocks(functional.relu(self.down(fine)))
         both = functional.relu(fine + functional.pixel_shuffle(self.up(coarse), 2))
-        return functional.pixel_shuffle(self.out(functional.relu(self.head(both))), BLOCK)[:, 0]
+        return functional.pixel_shuffle(self.out(functional.relu(self.head(both))), CELL_PIXELS)[:, 0]
 
 
 def rotate(images: Tensor, angles: Tensor, size: int) -> Tensor:
@@ -95,5 +95,5 @@ def rotate(images: Tensor, angles: Tensor, size: int) -> Tensor:
 def score(network: nn.Module, image: Tensor) -> Tensor:
     """As `grasp.score_image`: scores `[16, 224, 224]` of an image `[4, 224, 224]` whose table is 0."""
     angles = torch.from_numpy(grasp_angles())
-    views = rotate(image.expand(ROTATIONS, *image.shape), angles, VIEW)
+    views = rotate(image.expand(ROTATIONS, *image.shape), angles, VIEW_PIXELS)
     return rotate(torch.sigmoid(network(views))[:, None], -angles, WORKSPACE.pixels)[:, 0]

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from dipn_jax.networks import push_frame, stepwise
 from dipn_jax.networks.dipn import DipnConfig
-from dipn_jax.networks.push_frame import DIRECTIONS
+from dipn_jax.networks.push_frame import OUTLINE_DIRECTIONS
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 
 Inputs = dict[str, Tensor]
@@ -95,19 +95,19 @@ class Compact(nn.Module):
     def __init__(self, config: DipnConfig) -> None:
         super().__init__()
         view, width, f = config.view, config.width, config.features
-        small = (view.crop_side // stepwise.FOLD + 1) // 2
-        self.stem = nn.Conv2d(view.channels * stepwise.FOLD**2, width, 3, 1, 1)
+        small = (view.crop_side // stepwise.FOLDED_SAMPLES + 1) // 2
+        self.stem = nn.Conv2d(view.channels * stepwise.FOLDED_SAMPLES**2, width, 3, 1, 1)
         self.block = nn.ModuleList([nn.Conv2d(width, width, 3, 1, 1) for _ in range(2)])
         self.down, self.code = nn.Conv2d(width, 2 * width, 3, 2, 1), nn.Linear(small**2 * 2 * width, f)
-        self.begin = mlp(f + 2 * DIRECTIONS + 2, (f, f))
-        self.node = nn.Linear(f + 4 * DIRECTIONS + 2, f)
+        self.begin = mlp(f + 2 * OUTLINE_DIRECTIONS + 2, (f, f))
+        self.node = nn.Linear(f + 4 * OUTLINE_DIRECTIONS + 2, f)
         rounds = range(config.rounds)
         self.first, self.second, self.message = (
             nn.ModuleList([nn.Linear(f, f) for _ in rounds]) for _ in range(3)
         )  # fmt: skip
-        self.edge = nn.ModuleList([nn.Linear(DIRECTIONS + 2, f) for _ in rounds])
+        self.edge = nn.ModuleList([nn.Linear(OUTLINE_DIRECTIONS + 2, f) for _ in rounds])
         self.update = nn.ModuleList([mlp(2 * f, (f, f), linear_end=True) for _ in rounds])
-        self.memory, self.motion = nn.Linear(f, f), mlp(f, (f, 3 * stepwise.STRIDE), linear_end=True)
+        self.memory, self.motion = nn.Linear(f, f), mlp(f, (f, 3 * stepwise.STEP_CENTIMETRES), linear_end=True)
         self.register_buffer("normals", torch.from_numpy(push_frame.directions()), persistent=False)
         self.register_buffer("gripper", torch.from_numpy(np.asarray(stepwise.GRIPPER_REACH)), persistent=False)
 
@@ -115,15 +115,17 @@ class Compact(nn.Module):
         """Motions `[B, N, PUSH_STEPS, 3]`."""
         b, n = inputs["present"].shape
         outline, centers = inputs["outlines"], inputs["centers"]
-        folded = functional.pixel_unshuffle(inputs["crops"].flatten(0, 1).movedim(-1, 1), stepwise.FOLD)
+        folded = functional.pixel_unshuffle(inputs["crops"].flatten(0, 1).movedim(-1, 1), stepwise.FOLDED_SAMPLES)
         x = functional.relu(self.stem(folded))
         x = functional.relu(x + self.block[1](functional.relu(self.block[0](x))))
         code = functional.relu(self.code(functional.relu(self.down(x)).flatten(1))).unflatten(0, (b, n))
-        hidden = self.begin(torch.cat([code, 20 * outline.flatten(2), 10 * centers], -1))
+        hidden = self.begin(
+            torch.cat([code, stepwise.OUTLINE_SCALE * outline.flatten(2), stepwise.PLACE_SCALE * centers], -1)
+        )
         others = _others(inputs["present"])
         place, moved = centers, torch.zeros(b, n, 3)
         course = []
-        for step in range(0, PUSH_STEPS, stepwise.STRIDE):
+        for step in range(0, PUSH_STEPS, stepwise.STEP_CENTIMETRES):
             reach = self.turn(outline, moved[..., 2] * (np.pi / 180))
             ahead = place - torch.tensor([step * 0.01, 0.0])
             hidden, delta = self.advance(hidden, ahead, place, reach, others)
@@ -142,8 +144,8 @@ class Compact(nn.Module):
 
     def gaps(self, offset: Tensor, first: Tensor, second: Tensor) -> Tensor:
         """As `stepwise.gaps`, in the network's unit."""
-        gap = offset @ self.normals.T - first - torch.roll(second, DIRECTIONS // 2, -1)
-        return torch.clamp(gap, -0.04, 0.06) * 100
+        gap = offset @ self.normals.T - first - torch.roll(second, OUTLINE_DIRECTIONS // 2, -1)
+        return torch.clamp(gap, stepwise.LEAST_GAP, stepwise.LARGEST_GAP) * stepwise.GAP_SCALE
 
     def advance(
         self, hidden: Tensor, ahead: Tensor, place: Tensor, reach: Tensor, others: Tensor
@@ -151,9 +153,15 @@ class Compact(nn.Module):
         """As `Stepwise._advance`."""
         whole = reach[..., 0]
         gripper = [self.gaps(ahead, self.gripper, reach[..., k]) for k in range(2)]
-        state = functional.relu(self.node(torch.cat([hidden, 20 * reach.flatten(2), *gripper, 10 * ahead], -1)))
+        state = functional.relu(
+            self.node(
+                torch.cat(
+                    [hidden, stepwise.OUTLINE_SCALE * reach.flatten(2), *gripper, stepwise.PLACE_SCALE * ahead], -1
+                )
+            )
+        )
         offset = place[:, None] - place[:, :, None]
-        pair = torch.cat([self.gaps(offset, whole[:, :, None], whole[:, None]), 10 * offset], -1)
+        pair = torch.cat([self.gaps(offset, whole[:, :, None], whole[:, None]), stepwise.PLACE_SCALE * offset], -1)
         for first, second, edge, message, update in zip(
             self.first, self.second, self.edge, self.message, self.update, strict=True
         ):
@@ -161,7 +169,7 @@ class Compact(nn.Module):
             heard = (functional.relu(message(heard)) * others).sum(2)
             state = state + update(torch.cat([state, heard], -1))
         state = functional.relu(state)
-        delta = 2.0 * self.motion(state).unflatten(-1, (stepwise.STRIDE, 3))
+        delta = stepwise.MOTION_SCALE * self.motion(state).unflatten(-1, (stepwise.STEP_CENTIMETRES, 3))
         return hidden + torch.tanh(self.memory(state)), delta
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import pathlib
 from collections.abc import Callable
@@ -21,11 +22,12 @@ from dipn_jax.world import shapes
 from . import world
 
 CAMERA_SCENES = 50
+"""Scenes that the camera is compared on."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How much is measured."""
+    """Amount of what is measured."""
 
     engines: tuple[str, ...]
     scenes: int
@@ -43,7 +45,7 @@ class Plan:
 
 
 def run(out: pathlib.Path, plan: Plan) -> None:
-    """Measure and write `metrics.json` and `world.md`; sections already measured with this plan are not repeated.
+    """Measure, and write `metrics.json` and `world.md`; sections already measured with this plan are not repeated.
 
     Raises:
       UserError: an engine cannot run here, or the folder belongs to another plan.
@@ -51,8 +53,8 @@ def run(out: pathlib.Path, plan: Plan) -> None:
     console.require_out(out)
     engines = {}
     for name in plan.engines:
-        kind, changes = world.ENGINES[name]
-        engines[name] = make_engine(kind, **changes)
+        variant = world.ENGINES[name]
+        engines[name] = make_engine(variant.engine, timestep=variant.timestep, sleep=variant.sleep)
     code = {"versions": files.package_versions(), "code": files.code_digest(pathlib.Path(__file__).parent)}
     settings = json.loads(json.dumps(dataclasses.asdict(plan))) | code
     files.claim(out, settings, free=("engines",))
@@ -64,7 +66,7 @@ def run(out: pathlib.Path, plan: Plan) -> None:
             if not path.exists():
                 files.write_json(path, {k: v if np.isfinite(v) else None for k, v in measure().items()})
             progress.advance(1, name)
-    for path in sorted((out / "sections").glob("*.json")):  # those of engines asked for before, too
+    for path in sorted((out / "sections").glob("*.json")):  # also those of engines of earlier runs
         metrics.update(files.read_json(path))
     files.write_json(out / "settings.json", settings)
     files.write_json(out / "metrics.json", metrics)
@@ -73,17 +75,15 @@ def run(out: pathlib.Path, plan: Plan) -> None:
 
 
 def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], dict[str, float]]]:
-    """What is measured, by name."""
+    """Return the functions that measure each section, by name."""
     native = make_engine("native")
     keys = jax.random.split(jax.random.key(plan.seed), 3)
-    known: dict[str, Any] = {}
 
+    @functools.cache
     def reference() -> tuple[world.Trial, dict[str, float], np.ndarray, np.ndarray]:
-        if not known:
-            made = world.trial(keys[1], native, plan.scenes)
-            found, poses = world.pushes(native, made)
-            known["all"] = made, found, poses, world.held_by(native, made)
-        return known["all"]
+        made = world.trial(keys[1], native, plan.scenes)
+        found, poses = world.pushes(native, made)
+        return made, found, poses, world.held_by(native, made)
 
     def agree(name: str, engine: Engine) -> dict[str, float]:
         made, _, poses, held = reference()
@@ -91,10 +91,10 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
         return world.agreement(name, engine, made.first(count), poses[:count], held[:count])
 
     def crowds(name: str, engine: Engine) -> dict[str, float]:
-        return world.drops(keys[0], engine, plan.few, name=f"drop-{name}", counts=world.CROWDED)
+        return world.drops(keys[0], engine, plan.few, name=f"drop-{name}", counts=world.CROWDED_COUNTS)
 
     def may_crowd(engine: Engine) -> bool:
-        """MuJoCo Warp would take hours of a CPU."""
+        """Return whether an engine is fast enough here; MuJoCo Warp would take hours on a CPU."""
         return engine.name == "mjx" or (engine.name == "warp" and jax.default_backend() != "cpu")
 
     return {
@@ -113,12 +113,13 @@ def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], 
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
+    """Return a table as Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 class _Cells:
-    """Figures as they stand in tables; nothing where there is none."""
+    """Figures as text for tables; empty where one is missing."""
 
     def __init__(self, metrics: dict[str, Any]) -> None:
         self.metrics = metrics
@@ -136,7 +137,7 @@ class _Cells:
 
 
 def page(metrics: dict[str, Any]) -> str:
-    """The figures as Markdown."""
+    """Return the figures as Markdown."""
     cells = _Cells(metrics)
     parts = [
         *_drop_parts(cells),
@@ -153,7 +154,7 @@ def _drop_parts(cells: _Cells) -> list[str]:
     drops = [
         [name, str(n), cells.number(f"{key}/{n}/tries", ".0f"), *(cells.share(f"{key}/{n}/{c}") for c in columns)]
         for name, key in [("native", "drop"), *((name, f"drop-{name}") for name in world.ENGINES)]
-        for n in world.COUNTS
+        for n in world.DROPPED_COUNTS
         if f"{key}/{n}/kept" in cells.metrics
     ]
     rests = [

@@ -1,4 +1,4 @@
-"""key -> a batch of episodes: set up, settle, look, act, read. Nothing here knows a file."""
+"""Batches of episodes from a random key: draw scenes, settle them, look, act and record. Nothing here knows a file."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from dipn_jax.planning import candidates
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import render
 from dipn_jax.structs import (
+    Array,
     Fault,
     Grasp,
     GraspEpisode,
@@ -28,7 +29,7 @@ from dipn_jax.world import clutter, primitives, scenes
 
 @dataclasses.dataclass
 class Batch:
-    """Episodes that passed and what was counted on the way."""
+    """Usable episodes, and counts of drops and faults."""
 
     episodes: Any
     counts: dict[str, int]
@@ -43,7 +44,7 @@ def push_batch(
     actions: int,
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,),
 ) -> Batch:
-    """`actions` different pushes on each of up to `count` settled scenes, each once for every one of `distances`."""
+    """Push `actions` times on each of up to `count` settled scenes, and every push once for each of `distances`."""
     drop, aim = jax.random.split(key)
     items, counts = clutter.settled(drop, engine, config, count)
     n = len(items.fault)
@@ -64,8 +65,12 @@ def push_batch(
     return _drop_unusable(episodes, counts, together=len(distances))
 
 
-def aim_pushes(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> tuple[Push, jax.Array]:
-    """Random 10 cm pushes `[B, actions]` of what is seen of scenes `[B, N]` at `poses [B, N, 7]`; whether feasible."""
+def aim_pushes(keys: jax.Array, scene: Scene, poses: Array, *, actions: int) -> tuple[Push, jax.Array]:
+    """Draw 10 cm pushes `[B, actions]` on the visible objects of scenes `[B, N]` at `poses [B, N, 7]`.
+
+    Returns:
+      The pushes, and which of them are feasible `[B, actions]`.
+    """
     return batching.in_batches(functools.partial(_aim_pushes, actions=actions), keys, scene, poses)
 
 
@@ -80,11 +85,11 @@ def _aim_pushes(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
 
 @dataclasses.dataclass(frozen=True)
 class Guide:
-    """Which grasps are tried, besides random ones."""
+    """Network that chooses grasps to try, and the shares of those grasps."""
 
     scorer: Scorer
-    guided: float  # share of those that it believes in
-    hard: float  # share of those that it is unsure of
+    guided: float  # share of grasps that it scores high
+    hard: float  # share of grasps that it is unsure of
 
 
 def grasp_batch(
@@ -96,7 +101,7 @@ def grasp_batch(
     actions: int,
     guide: Guide | None = None,
 ) -> Batch:
-    """`actions` grasps on each of up to `count` settled scenes: at random foreground pixels and angles, or guided."""
+    """Grasp `actions` times on each of up to `count` settled scenes: at random foreground pixels, or guided."""
     drop, aim = jax.random.split(key)
     items, counts = clutter.settled(drop, engine, config, count)
     n = len(items.fault)
@@ -118,8 +123,8 @@ def grasp_batch(
     return _drop_unusable(episodes, counts)
 
 
-def aim_grasps(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int, guide: Guide | None = None) -> Grasp:
-    """Grasps `[B, actions]` of the foreground seen of scenes `[B, N]` at `poses [B, N, 7]`."""
+def aim_grasps(keys: jax.Array, scene: Scene, poses: Array, *, actions: int, guide: Guide | None = None) -> Grasp:
+    """Draw grasps `[B, actions]` on the visible foreground of scenes `[B, N]` at `poses [B, N, 7]`."""
     return batching.in_batches(functools.partial(_aim_grasps, actions=actions, guide=guide), keys, scene, poses)
 
 
@@ -130,8 +135,7 @@ def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
         if guide is None:
             return candidates.random_grasps(args[0], seen, count=actions)
         scores = guide.scorer(render.rgbd(seen)[None])[0]
-        shares = {"guided": guide.guided, "hard": guide.hard}
-        return candidates.sample_grasps(args[0], seen, scores, count=actions, **shares)
+        return candidates.sample_grasps(args[0], seen, scores, count=actions, guided=guide.guided, hard=guide.hard)
 
     return jax.lax.map(one, (keys, scene, poses))
 
@@ -143,7 +147,7 @@ def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, c
 
 
 def _drop_unusable(episodes: Any, counts: dict[str, int], *, together: int = 1) -> Batch:
-    """Without the episodes that went wrong, and those `together` with them."""
+    """Return the usable episodes; where one of `together` neighbours is faulty, all of them are left out."""
     fault = episodes.fault
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})
     good = Fault.usable(fault).reshape(-1, together).all(-1).repeat(together)

@@ -1,5 +1,5 @@
-"""Episodes -> shards. A shard is a pure function of (config, shard index): any worker, any time, the same
-bytes (from the same versions, on the same kind of processor).
+"""Shards of episodes. A shard is a pure function of the config and its index: every worker writes the same bytes at any
+time (with the same versions, on the same kind of processor).
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from dipn_jax.engine import Engine, EngineName
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine, resolve
 from dipn_jax.planning.planner import Scorer
-from dipn_jax.storage import records
+from dipn_jax.storage import records, shards
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 
 from . import episodes
 
 MAX_ATTEMPTS = 100
-"""Batches without a single usable episode before giving up."""
+"""Batches without a single usable episode after which a shard is given up."""
 MAX_ACTIONS = 256
-"""Actions tried on one scene."""
-AT_ONCE = 2
-"""Shards in the making: what one leaves idle of the processor, the other takes."""
+"""Actions that may be tried on one scene."""
+SHARDS_AT_ONCE = 2
+"""Shards that are made at the same time: one uses the cores that the other leaves idle."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """Everything that a data set is a function of."""
+    """Everything that determines a data set."""
 
     kind: str
     scene: SceneConfig
@@ -48,8 +48,8 @@ class Job:
     engine: EngineName = "auto"
     timestep: float | None = None  # seconds; the engine's own if None
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,)  # metres: each push is made once for every one of them
-    guided: float = 0.0  # share of grasps that a network believes in
-    hard: float = 0.0  # share of grasps that it is unsure of
+    guided: float = 0.0  # share of grasps that a network scores high
+    hard: float = 0.0  # share of grasps that the network is unsure of
     weights: str = ""  # SHA-256 of that network
 
     def __post_init__(self) -> None:
@@ -68,32 +68,32 @@ class Job:
             )
 
     def shards(self) -> int:
-        """How many shards the data set has."""
+        """Return how many shards the data set has."""
         return -(-self.episodes // self.shard_size)
 
     def describe(self) -> dict[str, Any]:
-        """As JSON, beside the shards; with the kind of device where the size of a batch depends on it."""
+        """Return the job as it is written beside the shards; with the kind of device if batches depend on it."""
         device = {} if self.engine == "native" else {"device": jax.default_backend()}
         return json.loads(json.dumps(dataclasses.asdict(self))) | device
 
     def size(self, index: int) -> int:
-        """Episodes of shard `index`."""
+        """Return the number of episodes of shard `index`."""
         return min(self.shard_size, self.episodes - index * self.shard_size)
 
 
 class _Tally:
-    """What all shards at hand have counted, beside the progress bar. Threads share it."""
+    """Counts of all shards of this run, shown beside the progress bar. Threads share it."""
 
     def __init__(self, progress: console.Progress) -> None:
         self.progress, self.counts, self.lock = progress, collections.Counter[str](), threading.Lock()
 
     def add(self, fresh: int, counts: dict[str, int]) -> None:
-        """`fresh` more episodes; `counts` of the batch they came from."""
+        """Add `fresh` episodes, and the `counts` of the batch that they are from."""
         with self.lock:
             self.counts.update(counts)
             faults = {name: n for name, n in sorted(self.counts.items()) if n and name != "dropped_scenes"}
             said = ", ".join(f"{n} {name}" for name, n in faults.items()) or "no faults"
-            self.progress.advance(fresh, f"{self.counts['dropped_scenes']} scenes let fall; {said}")
+            self.progress.advance(fresh, f"{self.counts['dropped_scenes']} scenes dropped; {said}")
 
 
 def _maker(job: Job, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
@@ -110,7 +110,7 @@ def _maker(job: Job, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
 def shard(
     job: Job, index: int, engine: Engine, tally: _Tally, scorer: Scorer | None = None
 ) -> tuple[Any, dict[str, int]]:
-    """The episodes of one shard and what was counted while making them."""
+    """Return the episodes of one shard and the counts of the batches that they are from."""
     want = job.size(index)
     key = jax.random.fold_in(jax.random.key(job.seed), index)
     make = _maker(job, scorer)
@@ -136,17 +136,16 @@ def shard(
 
 
 def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1, scorer: Scorer | None = None) -> None:
-    """Write the shards of `job` that are missing; `part` of `of` workers takes every `of`-th.
+    """Write the shards of `job` that are missing; worker `part` of `of` workers takes every `of`-th.
 
-    Two shards are in the making at any time: while one is stepped, the scenes of the other are stepped, too, or drawn,
-    built, looked at, sifted, encoded or written.
+    Two shards are made at a time: while one is simulated, the other is simulated, too, or drawn, rendered or written.
 
     Args:
-      job: what the data set is a function of.
+      job: everything that determines the data set.
       out: its folder.
       part: number of this worker.
       of: number of workers.
-      scorer: of `job.weights`, for guided and hard grasps.
+      scorer: the network of `job.weights`, for guided and hard grasps.
 
     Raises:
       UserError: the folder holds a data set of another config.
@@ -170,16 +169,16 @@ def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1, scorer:
 def _write_all(
     job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tally: _Tally, scorer: Scorer | None
 ) -> None:
-    """Make and write the shards `todo`, AT_ONCE at a time; the first error stops all."""
+    """Make and write the shards `todo`, SHARDS_AT_ONCE at a time; the first error stops all."""
     # the content of a shard does not depend on how many others there are
     config = {key: value for key, value in job.describe().items() if key != "episodes"}
 
     def one(index: int) -> None:
         made, counts = shard(job, index, engine, tally, scorer)
-        records.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
+        shards.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
         records.update_manifest(out)
 
-    with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
+    with concurrent.futures.ThreadPoolExecutor(SHARDS_AT_ONCE) as pool:
         futures: list[concurrent.futures.Future[None]] = []
         try:
             futures += [pool.submit(one, index) for index in todo]
@@ -193,13 +192,13 @@ def _write_all(
 
 
 def _written(out: pathlib.Path, index: int, job: Job) -> bool:
-    """Whether shard `index` is there with all its episodes; one that is too short is made anew."""
-    path = records.shard_path(out, index)
-    return path.exists() and records.count(path) == job.size(index)
+    """Return whether shard `index` is there with all its episodes; a shorter one is made anew."""
+    path = shards.shard_path(out, index)
+    return path.exists() and shards.count(path) == job.size(index)
 
 
 def _claim(job: Job, out: pathlib.Path) -> None:
-    """A folder holds one config; more episodes of it may be asked for later, not fewer."""
+    """Claim the folder, which holds data of one config; a later run may ask for more episodes, not for fewer."""
     files.claim(out, job.describe() | {"episodes": max(job.episodes, _begun_with(out))}, free=("episodes",))
     if job.episodes < _begun_with(out):
         raise UserError(
@@ -208,6 +207,7 @@ def _claim(job: Job, out: pathlib.Path) -> None:
 
 
 def _begun_with(out: pathlib.Path) -> int:
+    """Return the number of episodes that the folder was begun with; 0 if it was not."""
     path = out / "config.json"
     episodes = files.read_json(path).get("episodes", 0) if path.exists() else 0
     if not isinstance(episodes, int):

@@ -1,4 +1,4 @@
-"""Is the world right? Figures of drops, pushes, grasps, the camera and the engines: `dipn-datagen check-world`."""
+"""Figures that show whether the world is right: drops, pushes, grasps, the camera and the engines."""
 
 from __future__ import annotations
 
@@ -20,43 +20,56 @@ from dipn_jax.world import clutter, model, primitives, scenes, shapes
 
 from . import episodes, isolated
 
-COUNTS = (1, 3, 7, 10, 20, 30)
-"""Numbers of objects that drops are counted for."""
-CROWDED = (10, 20, 30)
-"""Numbers for which engines that keep a limited number of contacts are tried, too."""
-MOVED = 0.001
-"""Metres: what the reference moves by more during a push counts in the engines' agreement."""
-GRASPS = 4
-"""Grasps of each scene in the engines' agreement: one alone would make a share of few."""
-AS_PUT = np.deg2rad(5)
+DROPPED_COUNTS = (1, 3, 7, 10, 20, 30)
+"""Numbers of objects for which drops are measured."""
+CROWDED_COUNTS = (10, 20, 30)
+"""Numbers of objects for which drops are also measured with engines that keep a limited number of contacts."""
+MOVED_DISTANCE = 0.001
+"""Metres by which the reference has to move an object in a push for it to count in the engines' agreement."""
+GRASPS_PER_SCENE = 4
+"""Grasps of each scene in the engines' agreement; with one alone, the share would be of too few."""
+AS_PUT_ANGLE = np.deg2rad(5)
 """Radians by which an object that stays as it is put may turn."""
-ENGINES: dict[str, tuple[EngineName, dict[str, float]]] = {
-    "native_awake": ("native", {"sleep": 0.0}),
-    "native_1ms": ("native", {"timestep": 0.001}),
-    "native_3.3ms": ("native", {"timestep": 0.01 / 3}),
-    "native_5ms": ("native", {"timestep": 0.005}),
-    "mjx": ("mjx", {}),
-    "warp": ("warp", {}),
-}
-"""What can be held against `native` as it is (2 ms, resting objects asleep): engine and what is otherwise."""
 Metrics = dict[str, float]
 
 
 @dataclasses.dataclass(frozen=True)
+class Variant:
+    """An engine, and settings of it that differ from its own."""
+
+    engine: EngineName
+    timestep: float | None = None  # seconds
+    sleep: float | None = None  # see `PhysicsConfig`
+
+
+ENGINES = {
+    "native_awake": Variant("native", sleep=0.0),
+    "native_1ms": Variant("native", timestep=0.001),
+    "native_3.3ms": Variant("native", timestep=0.01 / 3),
+    "native_5ms": Variant("native", timestep=0.005),
+    "mjx": Variant("mjx"),
+    "warp": Variant("warp"),
+}
+"""Engines that can be compared with `native` as it is (2 ms, resting objects asleep)."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Trial:
-    """Settled scenes, and a push and some grasps for every one."""
+    """Settled scenes, with a push and some grasps for each."""
 
     items: SettledScene  # [B]
     pushes: Push  # [B]
     grasps: Grasp  # [B, A]
 
     def first(self, count: int) -> Trial:
-        """The first `count` of them."""
+        """Return the first `count` of them."""
         return Trial(*(structs.take(x, slice(0, count)) for x in (self.items, self.pushes, self.grasps)))
 
 
-def drops(key: jax.Array, engine: Engine, tries: int, *, name: str = "drop", counts: Sequence[int] = COUNTS) -> Metrics:
-    """`{name}/{objects}/kept` and `{name}/{objects}/{fault}`: shares of random drops."""
+def drops(
+    key: jax.Array, engine: Engine, tries: int, *, name: str = "drop", counts: Sequence[int] = DROPPED_COUNTS
+) -> Metrics:
+    """Measure random drops: shares `{name}/{objects}/kept` and `{name}/{objects}/{fault}`."""
     found: Metrics = {}
     for count in counts:
         kept, counted = clutter.settled(key, engine, scenes.parse_objects(str(count)), tries)
@@ -69,10 +82,10 @@ def drops(key: jax.Array, engine: Engine, tries: int, *, name: str = "drop", cou
 
 
 def rests(name: str, engine: Engine, seed: int) -> Metrics:
-    """`rest/{engine}/...`: every catalogue item set down on every face that it can stand on.
+    """Measure `rest/{engine}/...`: every catalogue item set down on every face that it can stand on.
 
-    Shares that come to rest and that stay as they were put (within AS_PUT), the largest turn, and how far from the
-    table at most the lowest corner of one at rest is.
+    The shares that come to rest, and that stay as they were put (within AS_PUT_ANGLE), the largest turn, and the
+    largest distance of the lowest corner from the table at rest.
     """
     made = [isolated.standing(np.random.default_rng(seed), item) for item in shapes.CATALOGUE]
     scene, poses = structs.concatenate([scene for scene, _ in made]), np.concatenate([start for _, start in made])
@@ -82,7 +95,7 @@ def rests(name: str, engine: Engine, seed: int) -> Metrics:
     turn = _turn(after[..., 3:], poses[..., 3:])
     return {
         f"rest/{name}/at_rest": float((fault == 0).mean()),
-        f"rest/{name}/as_put": float((turn < AS_PUT).mean()),
+        f"rest/{name}/as_put": float((turn < AS_PUT_ANGLE).mean()),
         f"rest/{name}/turn_max_deg": float(np.rad2deg(turn.max())),
         f"rest/{name}/from_table_max_mm": float(gap.max()),
         f"rest/{name}/tries": len(fault),
@@ -90,7 +103,7 @@ def rests(name: str, engine: Engine, seed: int) -> Metrics:
 
 
 def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
-    """`grasp_isolated/{shape}`: share of `isolated.share_held`; and grasps that must not hold."""
+    """Measure `grasp_isolated/{shape}`, the share of `isolated.share_held`; and grasps that must not hold."""
     found = {}
     for item in shapes.CATALOGUE:
         found[f"grasp_isolated/{item.name}"], count = isolated.share_held(
@@ -103,29 +116,29 @@ def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
 
 
 def trial(key: jax.Array, engine: Engine, count: int) -> Trial:
-    """`count` scenes of 1 to 7 objects, with a random feasible push and GRASPS random grasps of the foreground."""
+    """Draw `count` scenes of 1 to 7 objects, each with a random feasible push and GRASPS_PER_SCENE random grasps."""
     drop, aim = jax.random.split(key)
     items = clutter.settled_scenes(drop, engine, scenes.SceneConfig(), max(2 * count, 8))
     keys = jax.random.split(aim, len(items.fault))
     pushes, feasible = episodes.aim_pushes(keys, items.scene, items.poses, actions=1)
-    grasps = episodes.aim_grasps(keys, items.scene, items.poses, actions=GRASPS)
+    grasps = episodes.aim_grasps(keys, items.scene, items.poses, actions=GRASPS_PER_SCENE)
     index = np.flatnonzero(np.asarray(feasible)[:, 0])[:count]
     pushes = jax.tree.map(lambda leaf: np.asarray(leaf)[index, 0], pushes)
     return Trial(structs.take(items, index), pushes, structs.take(grasps, index))
 
 
 def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle `[...]` (radians) between orientations `[..., 4]`; by the chord, as a cosine near one has no digits."""
+    """Return the angle `[...]` (radians) of orientations `[..., 4]`; by the chord, as cosines near 1 lack digits."""
     a, b = (q / np.linalg.norm(q, axis=-1, keepdims=True) for q in (np.asarray(a, float), np.asarray(b, float)))
     chord = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
     return 4 * np.arcsin(np.clip(chord / 2, 0.0, 1.0))
 
 
 def pushes(engine: Engine, made: Trial) -> tuple[Metrics, np.ndarray]:
-    """`push/...`: shares of what becomes of pushes and pushed objects; and the poses `[B, 12, N, 7]`."""
+    """Measure `push/...`: shares of outcomes of pushes and pushed objects; also return the poses `[B, 12, N, 7]`."""
     rollout = primitives.push(engine, made.items.scene, made.items.poses, made.pushes)
     poses, fault = np.asarray(rollout.poses), np.asarray(rollout.fault)
-    moved = np.linalg.norm(poses[:, -1, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED
+    moved = np.linalg.norm(poses[:, -1, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED_DISTANCE
     tipped = np.asarray(primitives.tipped(poses[:, 0, :, 3:], poses[:, -1, :, 3:]))
     deep = [_depths(made, poses[:, k], np.asarray(rollout.gripper)[:, k]).max() for k in range(PUSH_STEPS + 1)]
     found = {
@@ -139,7 +152,7 @@ def pushes(engine: Engine, made: Trial) -> tuple[Metrics, np.ndarray]:
 
 
 def _depths(made: Trial, poses: np.ndarray, gripper: np.ndarray) -> np.ndarray:
-    """Deepest contact `[B]` (metres) among objects, table and gripper: one that tunnels is deep on its way."""
+    """Return the deepest contact `[B]` (metres) among objects, table and gripper; tunnelling shows as a deep one."""
     scene = made.items.scene
     texts = [model.mjcf(structs.take(scene, i), config=native.DEFAULTS, alike=True) for i in range(len(poses))]
     models = [mujoco.MjModel.from_xml_string(text) for text in texts]
@@ -148,7 +161,7 @@ def _depths(made: Trial, poses: np.ndarray, gripper: np.ndarray) -> np.ndarray:
 
 
 def sweep(engine: Engine, made: Trial, poses: np.ndarray) -> Metrics:
-    """`sweep/{k}cm/...`: separate pushes, ended by a retreat, against the poses at `k` cm of a longer one."""
+    """Measure `sweep/{k}cm/...`: separate pushes, ended by a retreat, against the poses at `k` cm of a longer one."""
     found = {}
     for centimetres in (3, 5, 7):
         short = made.pushes.replace(distance=np.full(len(poses), centimetres * 0.01, np.float32))
@@ -158,8 +171,8 @@ def sweep(engine: Engine, made: Trial, poses: np.ndarray) -> Metrics:
 
 
 def _apart(name: str, found: np.ndarray, wanted: np.ndarray, poses: np.ndarray) -> Metrics:
-    """Quantiles of the distance and angle between poses `[B, N, 7]`, of objects that `poses [B, S, N, 7]` moves."""
-    moved = np.linalg.norm(poses[:, PUSH_STEPS, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED
+    """Return quantiles of distance and angle between poses `[B, N, 7]`, of objects moved in `poses [B, S, N, 7]`."""
+    moved = np.linalg.norm(poses[:, PUSH_STEPS, :, :3] - poses[:, 0, :, :3], axis=-1) > MOVED_DISTANCE
     distance = 1000 * np.linalg.norm(found[..., :3] - wanted[..., :3], axis=-1)[moved]
     angle = np.rad2deg(_turn(found[..., 3:], wanted[..., 3:]))[moved]
     if not moved.any():
@@ -172,7 +185,7 @@ def _apart(name: str, found: np.ndarray, wanted: np.ndarray, poses: np.ndarray) 
 
 
 def agreement(name: str, engine: Engine, made: Trial, poses: np.ndarray, held: np.ndarray) -> Metrics:
-    """`agreement/{engine}/...`: against the reference's `poses [B, 12, N, 7]` and `held [B, A, N]`."""
+    """Measure `agreement/{engine}/...` with the reference's `poses [B, 12, N, 7]` and `held [B, A, N]`."""
     rollout = primitives.push(engine, made.items.scene, made.items.poses, made.pushes)
     found: Metrics = {}
     for centimetres in (1, 5, 10):
@@ -188,7 +201,7 @@ def agreement(name: str, engine: Engine, made: Trial, poses: np.ndarray, held: n
 
 
 def camera(key: jax.Array, engine: Engine, count: int) -> Metrics:
-    """`camera/...`: the renderer against MuJoCo's ray caster on scenes of ten objects."""
+    """Measure `camera/...`: the renderer against MuJoCo's ray caster on scenes of ten objects."""
     items = clutter.settled_scenes(key, engine, scenes.fixed_count(10), count)
     seen = jax.jit(lambda scene, poses: jax.lax.map(lambda pair: render.render_depth(*pair), (scene, poses)))
     height, label = (np.asarray(x) for x in seen(items.scene, jnp.asarray(items.poses)))
@@ -205,7 +218,7 @@ def camera(key: jax.Array, engine: Engine, count: int) -> Metrics:
 
 
 def held_by(engine: Engine, made: Trial) -> np.ndarray:
-    """What an engine holds after each grasp `[B, A, N]`, every grasp from the settled scene."""
+    """Return which objects an engine holds after each grasp `[B, A, N]`, every grasp from the settled scene."""
     held = []
     for action in range(np.shape(made.grasps.angle)[1]):
         grasps = jax.tree.map(lambda leaf, a=action: np.asarray(leaf)[:, a], made.grasps)

@@ -11,12 +11,14 @@ import numpy as np
 
 BATCH = 64
 """Rows that compiled functions take at a time."""
-FEW = 16
+SMALL_BATCH = 16
 """Rows taken at a time where a row costs much, or where few are left."""
 
 
 def in_batches(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)` for any number of rows: BATCH or FEW at a time, so that two compiled shapes serve all.
+    """Return `function(*args)` for any number of rows, computed BATCH or SMALL_BATCH rows at a time.
+
+    So two compiled shapes serve any number of rows.
 
     Args:
       function: jitted, of pytrees with a leading axis, each row by itself.
@@ -28,7 +30,7 @@ def in_batches(function: Callable[..., Any], *args: Any) -> Any:
     count = len(jax.tree.leaves(args)[0])
     parts, start = [], 0
     while start < count:
-        size = BATCH if count - start > BATCH - FEW else FEW
+        size = BATCH if count - start > BATCH - SMALL_BATCH else SMALL_BATCH
         rows = np.arange(start, start + size) % count
         parts.append(function(*jax.tree.map(lambda leaf, rows=rows: leaf[rows], args)))
         start += size
@@ -36,16 +38,19 @@ def in_batches(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def in_small_batches(function: Callable[..., Any], *args: Any) -> Any:
-    """As `in_batches`, FEW at a time, for functions that are dear: `function(*rows, real)` is told which rows count.
+    """Return `function(*args)` as `in_batches` does, SMALL_BATCH rows at a time; for functions that cost much a row.
+
+    `function(*rows, real)` also gets `real [SMALL_BATCH]` bool: which of its rows are rows of `args`. The others only
+    fill the batch up.
 
     Args:
-      function: jitted, of pytrees with a leading axis, and of `real [FEW]` bool.
+      function: jitted, of pytrees with a leading axis, and of `real [SMALL_BATCH]` bool.
       args: pytrees with a leading axis.
     """
     count = len(jax.tree.leaves(args)[0])
     parts = []
-    for start in range(0, count, FEW):
-        rows = np.arange(start, start + FEW)
+    for start in range(0, count, SMALL_BATCH):
+        rows = np.arange(start, start + SMALL_BATCH)
         some = jax.tree.map(lambda leaf, rows=rows % count: leaf[rows], args)
         parts.append(jax.device_get(function(*some, rows < count)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)

@@ -195,15 +195,24 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
       arguments: the command line; that of this process if not given.
 
     Returns:
-      The exit code: 0, or 2 after one line on standard error for a mistake of the user's; 130 when interrupted
-      (what was written before stays valid, and the same command continues from there).
+      The exit code, as `exit_code`.
     """
     enable_compilation_cache()
+    return exit_code(lambda: _parse_and_call(description, commands, sys.argv[1:] if arguments is None else arguments))
+
+
+def exit_code(work: Callable[[], int | None]) -> int:
+    """Do a command's work and turn what stops it into the exit code of the process.
+
+    Returns:
+      What `work` returns, or 0 if that is None; 2 after one line on standard error for a mistake of the user's; 130
+      when interrupted (what was written before stays valid, and the same command continues).
+    """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job manager's stop is an interruption
     try:
         try:
-            _parse_and_call(description, commands, sys.argv[1:] if arguments is None else arguments)
+            return work() or 0
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output, such as `head`, has closed it
@@ -220,7 +229,6 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from here", file=sys.stderr)
         return 130
-    return 0
 
 
 def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> None:

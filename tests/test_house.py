@@ -18,11 +18,13 @@ import dipn_jax
 ROOT = pathlib.Path(__file__).parent.parent
 STAGES = ("datagen", "train", "eval")
 PACKAGES = ("dipn_jax", *STAGES)
+TOPS = ("benchmarks", "experiments")
+"""What stands on top of everything else, and is not in the wheel."""
 MOST_LINES = 300
 """Of a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "files", "structs", "workspace", "geometry", "batching", "engine",
+    "errors", "files", "machine", "structs", "workspace", "geometry", "batching", "engine",
     "world", "physics", "sight", "networks", "storage", "planning", "console",
 ]  # fmt: skip
 
@@ -64,6 +66,13 @@ def test_the_library_imports_no_stage() -> None:
     for path in (ROOT / "dipn_jax").rglob("*.py"):
         for stage in STAGES:
             assert not _within(_imports(path), stage) + _within(_imports(path), f"dipn_jax.{stage}"), path
+
+
+@pytest.mark.parametrize("top", TOPS)
+def test_nobody_imports_benchmarks_or_experiments_and_neither_imports_the_other(top: str) -> None:
+    for package in {"dipn_jax", *STAGES, *TOPS} - {top}:
+        for path in (ROOT / package).rglob("*.py"):
+            assert not _within(_imports(path), top), path
 
 
 def test_inside_the_library_the_arrows_point_one_way() -> None:
@@ -122,10 +131,18 @@ def test_conventions() -> None:
 
 
 def test_every_module_has_a_docstring() -> None:
-    for package in (*PACKAGES, "benchmarks"):
+    for package in (*PACKAGES, *TOPS):
         for path in (ROOT / package).rglob("*.py"):
             text = path.read_text()
             assert not text.strip() or ast.get_docstring(ast.parse(text)), path
+
+
+def test_the_makefile_is_short_and_its_modules_exist() -> None:
+    lines = (ROOT / "Makefile").read_text().splitlines()
+    assert len(lines) <= 40 and max(map(len, lines)) <= 120
+    modules = {word for line in lines for word in line.split() if word.startswith("experiments.")}
+    for name in modules - {"experiments.NAME"}:
+        assert (ROOT / name.replace(".", "/")).with_suffix(".py").is_file(), name
 
 
 def test_no_file_is_longer_than_300_lines() -> None:

@@ -1,4 +1,4 @@
-"""What a learner of pushes and grasps sees, chooses and gets: many tables at once."""
+"""Observations, choices and rewards of a learner of pushes and grasps, on many tables at once."""
 
 from __future__ import annotations
 
@@ -20,25 +20,36 @@ from dipn_jax.sight import fingers, render
 from dipn_jax.structs import Array, Fault, Grasp, Push, Pytree, Scene
 from dipn_jax.world import clutter, primitives
 
-EXPLORE = (0.5, 0.1, 0.9998)
-"""Share of random actions at first and at last, and its decay per action. Source: VPG's released code."""
-CHANGED = (0.01, 300)
-"""Metres of height and pixels of it that make a change."""
+EXPLORED_AT_FIRST = 0.5
+"""Share of actions that are random at the beginning. Source: VPG's released code."""
+EXPLORED_AT_LEAST = 0.1
+"""Share of actions that stay random. Source: VPG's released code."""
+EXPLORATION_DECAY = 0.9998
+"""Factor of the share of random actions, for every action. Source: VPG's released code."""
+CHANGED_HEIGHT = 0.01
+"""Metres by which a pixel's height has to change to be counted; also the height above which it shows an object."""
+CHANGED_PIXELS = 300
+"""Pixels that have to change for the table to count as changed."""
 CHANGE_REWARD = 0.5
 """VPG's reward of a push that changes the scene."""
 DISCOUNT = 0.5
-"""VPG's discount of what comes next."""
-MOST = 1 / (1 - DISCOUNT)
-"""The highest value there is, of rewards of at most 1. What comes next is not believed to be worth more: the greatest
-of a million estimates is too great, and would feed on itself (without this, values are 5 after 2,500 actions)."""
-BETTER, UNCOVERED, COVERED, UNCOVERED_REWARD = 1.1, 300, -100, 0.8
-"""DQN+GN's push reward: the mean of the best grasp scores before and after if it rose so many times; at least so much
-if so many more pixels are covered with objects, nothing if so many fewer. Source: DIPN's released code."""
+"""VPG's discount of the next action's value."""
+HIGHEST_VALUE = 1 / (1 - DISCOUNT)
+"""Highest value that is possible, because rewards are at most 1. Estimates of the next value are cut off there: the
+greatest of a million estimates is too high, and would raise itself (without this, values are 5 after 2,500 actions)."""
+SCORE_RISE = 1.1
+"""DQN+GN: factor by which the best grasp score has to rise for a reward, the mean of both. Source: DIPN's code."""
+UNCOVERED_PIXELS = 300
+"""DQN+GN: pixels more that have to show objects for UNCOVERED_REWARD. Source: DIPN's code."""
+COVERED_PIXELS = -100
+"""DQN+GN: change of the pixels that show objects below which a push gets no reward. Source: DIPN's code."""
+UNCOVERED_REWARD = 0.8
+"""DQN+GN: least reward of a push that spreads objects out. Source: DIPN's code."""
 
 
 @flax.struct.dataclass
 class Look(Pytree):
-    """What a learner knows of a table."""
+    """A table as a learner sees it, and the actions that it may choose."""
 
     height: Array  # [H, W] metres
     push: Push  # the best one
@@ -63,7 +74,7 @@ def look(
     scorer: Scorer | None,
     distance: float,
 ) -> Look:
-    """What there is to do on each of the tables `[T]` that are `wanted [T]`; zeros of the others."""
+    """Look at the tables `[T]` that are `wanted [T]`, and find the best and random actions; zeros for the others."""
     network: VPG = nnx.merge(graph, params, rest)
     network.eval()
     pushes, grasps = scorers.value_scorers(network)
@@ -99,18 +110,21 @@ def look(
     return jax.lax.map(some, (keys, scene, poses, wanted))
 
 
-def choose(now: Look, rng: np.random.Generator, actions: int, *, may_push: bool) -> tuple[np.ndarray, Push, Grasp]:
-    """Which tables are pushed on `[T]` bool, and a push and a grasp for each: the best ones, or random ones.
+def explore(now: Look, rng: np.random.Generator, actions: int, *, may_push: bool) -> tuple[np.ndarray, Push, Grasp]:
+    """Choose the best action on each table, or now and then a random one, so that the learner explores.
 
     Args:
-      now: of the tables `[T]`.
-      rng: of the exploration.
-      actions: that were made before.
-      may_push: grasps only if not.
+      now: the tables `[T]`.
+      rng: random numbers of the exploration.
+      actions: number of actions that were made before.
+      may_push: whether pushes are allowed, too.
+
+    Returns:
+      Which tables are pushed on `[T]` bool, and a push and a grasp for each `[T]`.
     """
     count = len(now.grasp_value)
-    first, last, decay = EXPLORE
-    random = rng.uniform(size=count) < max(first * decay**actions, last)
+    explored = max(EXPLORED_AT_FIRST * EXPLORATION_DECAY**actions, EXPLORED_AT_LEAST)
+    random = rng.uniform(size=count) < explored
     coin = rng.uniform(size=count) < 0.5
     pushing = np.where(random, coin & now.can_push, now.push_value > now.grasp_value)
     pushing &= may_push
@@ -124,7 +138,11 @@ def choose(now: Look, rng: np.random.Generator, actions: int, *, may_push: bool)
 def execute(
     engine: Engine, scene: Scene, poses: np.ndarray, pushing: np.ndarray, push: Push, grasp: Grasp
 ) -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
-    """Scenes and poses afterwards, objects held `[T, N]` bool, simulations that can be believed `[T]` bool."""
+    """Push or grasp on each of the tables `[T]`.
+
+    Returns:
+      Scenes and poses afterwards, objects held `[T, N]` bool, and which simulations went without a fault `[T]` bool.
+    """
     shape, poses = np.array(scene.shape), np.array(poses)
     held, good = np.zeros(shape.shape, bool), np.ones(len(shape), bool)
     rows = np.flatnonzero(pushing)
@@ -139,23 +157,29 @@ def execute(
 
 
 def changed(now: Look, then: Look) -> np.ndarray:
-    """Which of the tables `[T]` look different."""
-    return (np.abs(then.height - now.height) > CHANGED[0]).sum((1, 2)) > CHANGED[1]
+    """Return which of the tables `[T]` look different."""
+    return (np.abs(then.height - now.height) > CHANGED_HEIGHT).sum((1, 2)) > CHANGED_PIXELS
 
 
 def push_reward(now: Look, then: Look, *, method: str) -> np.ndarray:
-    """Rewards `[T]` of pushes."""
+    """Return the rewards `[T]` of pushes."""
     different = changed(now, then)
     if method != "dqn":
         return CHANGE_REWARD * different
-    gained = (then.height > CHANGED[0]).sum((1, 2)) - (now.height > CHANGED[0]).sum((1, 2))
-    better = then.grasp_value > BETTER * now.grasp_value
+    gained = (then.height > CHANGED_HEIGHT).sum((1, 2)) - (now.height > CHANGED_HEIGHT).sum((1, 2))
+    better = then.grasp_value > SCORE_RISE * now.grasp_value
     reward = np.where(better, (now.grasp_value + then.grasp_value) / 2, 0.0)
-    reward = np.where(gained > UNCOVERED, np.maximum(reward, UNCOVERED_REWARD), reward)
-    return np.where(different & (gained >= COVERED), reward, 0.0)
+    reward = np.where(gained > UNCOVERED_PIXELS, np.maximum(reward, UNCOVERED_REWARD), reward)
+    return np.where(different & (gained >= COVERED_PIXELS), reward, 0.0)
 
 
-def with_future(reward: np.ndarray, then: Look, more: np.ndarray) -> np.ndarray:
-    """Targets `[T]` of Q-learning: reward, and discounted value of the best next action where there is `more`."""
-    future = np.minimum(np.maximum(then.push_value, then.grasp_value), MOST)
+def with_future(reward: np.ndarray, then: Look, more: Array) -> np.ndarray:
+    """Return targets `[T]` of Q-learning: reward, plus the discounted value of the best next action if there is one.
+
+    Args:
+      reward: `[T]`.
+      then: the tables after the action.
+      more: `[T]` bool: there is a next action.
+    """
+    future = np.minimum(np.maximum(then.push_value, then.grasp_value), HIGHEST_VALUE)
     return reward + DISCOUNT * np.where(more & np.isfinite(future), future, 0.0)

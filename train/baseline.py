@@ -1,4 +1,4 @@
-"""The compared methods learn while they act: values or chances of pushes and grasps.
+"""Learning of the compared methods while they act: values or chances of pushes and grasps.
 
 VPG and REA: Zeng et al., IROS 2018. DQN+GN: Huang et al., ICRA 2021, its push reward from their released code.
 """
@@ -24,21 +24,21 @@ from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.storage import checkpoint
-from dipn_jax.structs import Array, Grasp, GraspEpisode
+from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
 
 from . import acting, tables
 from .acting import Look
 from .configs import BaselineConfig
-from .grasp import PHASE, WINDOWS, Window, view, windows
+from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, view, windows
 from .loop import constant_adamw, make_step
 from .rounds import Run
 
-PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
+LEARNT_PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
 """What each method learns: REA+DIPN uses REA's grasps only, DQN+GN has GN for its grasps."""
-DISTANCE = 0.10
+PUSH_DISTANCE = 0.10
 """Metres of a push."""
-RECENT = 100
+RECENT_ACTIONS = 100
 """The number of last actions over which rewards are averaged."""
 
 
@@ -50,8 +50,10 @@ class State:
     rest: Any  # of the network: batch statistics
     moments: Any
     tables: tables.Tables
-    then: Look | None = None  # at the tables after their last action, by the weights of then
-    anew: Array = None  # [T] bool: those that were set anew since
+    then: Look | None = None  # of the tables after their last action, by the weights of that time
+    anew: np.ndarray = dataclasses.field(
+        default_factory=lambda: np.ones(0, bool)
+    )  # [T]: tables that were replaced since
     round: int = 0
     seen: dict[str, list[Window]] = dataclasses.field(default_factory=lambda: {"push": [], "grasp": []})
     did: list[tuple[str, float]] = dataclasses.field(default_factory=list)  # primitive and reward of each action
@@ -64,10 +66,13 @@ class _Outcomes:
         self.answers = answers
 
     def loss(self, model: nnx.Module, batch: dict[str, Window], key: jax.Array) -> jax.Array:
-        """Huber loss of values, or cross entropy of chances, at executed pixels; as published, nothing is mirrored."""
+        """Return the Huber loss of values, or the cross entropy of chances, at executed pixels.
+
+        As published, nothing is mirrored.
+        """
         total = jnp.zeros(())
         for name, some in batch.items():
-            images, pixel = view(some, jax.random.randint(key, (len(some.target), 2), 0, 2 * PHASE))
+            images, pixel = view(some, jax.random.randint(key, (len(some.target), 2), 0, 2 * SHIFT_PIXELS))
             out = getattr(model, name)(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
             if self.answers == "chance":
                 total += losses.score_loss(out, some.target, jnp.ones(len(images)))
@@ -89,8 +94,8 @@ def learn(
 
     Args:
       engine: physics.
-      scenes: what tables are made of.
-      config: how.
+      scenes: distribution of fresh tables.
+      config: how to learn.
       out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
       scorer: GN, whose grasps `dqn` executes.
       scored_by: digest of its weights.
@@ -105,17 +110,17 @@ def learn(
         raise UserError(
             f"baseline: --method {config.method} takes {'a' if config.method == 'dqn' else 'no'} --grasp-net"
         )
-    network = VpgConfig(config.preset, PARTS[config.method], "chance" if config.method == "rea" else "value")
+    network = VpgConfig(config.preset, LEARNT_PARTS[config.method], "chance" if config.method == "rea" else "value")
     model: Any = checkpoint.build("vpg", network, seed=config.seed)
-    identity = {**dataclasses.asdict(config), "scenes": str(scenes), "engine": type(engine).__name__}
-    identity |= {"grasp_net": scored_by} if scored_by else {}
-    run = Run(out, identity)
+    run = Run(out, _identity(engine, scenes, config, scored_by))
     ended = run.ended()
     if ended:
         return {name: value for name, value in ended.items() if name.startswith("reward/")}
     state = _play(run, model, engine, scenes, config, scorer)
     nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
-    result = _rewards(state.did, len(state.did)) | {f"{k}/recent": v for k, v in _rewards(state.did, RECENT).items()}
+    result = _rewards(state.did, len(state.did)) | {
+        f"{k}/recent": v for k, v in _rewards(state.did, RECENT_ACTIONS).items()
+    }
     extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
     run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
     return result
@@ -135,13 +140,19 @@ def _play(
         return State(weights, statistics, jax.device_get(optimizer.init(weights)), begun)
 
     def act(state: State) -> str:
-        look = functools.partial(acting.look, graph, state.params, state.rest, scorer=scorer, distance=DISTANCE)
+        look = functools.partial(acting.look, graph, state.params, state.rest, scorer=scorer, distance=PUSH_DISTANCE)
         _act(state, look, engine, scenes, config)
         state.params, state.rest, state.moments = _update(state, step, config)
-        return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT).items())
+        return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT_ACTIONS).items())
 
     total, log = -(-config.actions // config.tables), functools.partial(_log, run.out, config)
     return run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
+
+
+def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, scored_by: str) -> dict[str, Any]:
+    """Return everything that determines the run; runs without GN do not name one."""
+    identity = {**dataclasses.asdict(config), "scenes": str(scenes), "engine": type(engine).__name__}
+    return identity | ({"grasp_net": scored_by} if scored_by else {})
 
 
 def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneConfig, config: BaselineConfig) -> None:
@@ -153,7 +164,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     if state.then is not None:
         now = jax.tree.map(lambda a, b: np.where(anew.reshape(-1, *[1] * (a.ndim - 1)), a, b), now, state.then)
     rng = np.random.default_rng([config.seed, state.round])
-    pushing, push, grasp = acting.choose(now, rng, len(state.did), may_push="push" in PARTS[config.method])
+    pushing, push, grasp = acting.explore(now, rng, len(state.did), may_push="push" in LEARNT_PARTS[config.method])
     scene, poses, held, good = acting.execute(engine, before.scene, before.poses, pushing, push, grasp)
     then: Look = jax.device_get(look(keys[1], scene, poses, np.ones(count, bool)))
     changed = acting.changed(now, then)
@@ -167,7 +178,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
         ("push", pushing & good, push.start, push.angle),
         ("grasp", ~pushing & good, grasp.center, grasp.angle),
     ):
-        if name in PARTS[config.method] and rows.any():
+        if name in LEARNT_PARTS[config.method] and rows.any():
             aim = Grasp(centre, angle, np.zeros(count, np.float32))
             tried = GraspEpisode(
                 scene=before.scene,
@@ -178,15 +189,15 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
                 success=target.astype(np.float32),
                 fault=np.zeros(count, int),
             )
-            taught = windows(structs.take(tried, rows), pixels=WINDOWS[config.preset] + 2 * PHASE)
+            taught = windows(structs.take(tried, rows), pixels=WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS)
             state.seen[name].append(taught)
     state.did += [("push" if pushing[i] else "grasp", float(reward[i])) for i in np.flatnonzero(good)]
     state.anew, state.then = state.tables.step(scene, poses, effect, good, engine, scenes), then
 
 
 def _update(state: State, step: Callable[..., Any], config: BaselineConfig) -> tuple[Any, Any, Any]:
-    """Some optimizer steps on everything tried so far."""
-    parts = PARTS[config.method]
+    """Take some optimizer steps on everything tried so far."""
+    parts = LEARNT_PARTS[config.method]
     if not all(state.seen[name] for name in parts):
         return state.params, state.rest, state.moments
     seen = {name: structs.concatenate(state.seen[name]) for name in parts}
@@ -200,7 +211,7 @@ def _update(state: State, step: Callable[..., Any], config: BaselineConfig) -> t
 
 
 def _rewards(did: list[tuple[str, float]], last: int) -> dict[str, float]:
-    """Mean reward of the `last` actions, by primitive."""
+    """Return the mean reward of the `last` actions, by primitive."""
     recent = did[-last:]
     result = {}
     for name in ("push", "grasp"):
@@ -213,5 +224,5 @@ def _rewards(did: list[tuple[str, float]], last: int) -> dict[str, float]:
 def _log(out: pathlib.Path, config: BaselineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of actions after each round, and mean rewards of the last of them."""
     counts = range(config.tables, len(state.did) + 1, config.tables)
-    rows = [{"step": n, **_rewards(state.did[:n], RECENT)} for n in counts]
+    rows = [{"step": n, **_rewards(state.did[:n], RECENT_ACTIONS)} for n in counts]
     files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())

@@ -25,22 +25,22 @@ from .split import split
 
 PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
-WINDOWS = {"compact": 112, "paper": 320}
-"""Pixels around an executed grasp: the compact network sees about 50 on each side, the published one everything."""
-PHASE = 4
-"""Pixels by which a grasp is moved in its window at most: every phase of the network's strides is trained."""
+WINDOW_PIXELS = {"compact": 112, "paper": 320}
+"""Pixels of a window around an executed grasp: compact networks see about 50 on each side, published ones all."""
+SHIFT_PIXELS = 4
+"""Pixels by which a grasp is moved in its window at most, so that every phase of the network's strides is trained."""
 TABLE_WEIGHT = 0.05
 """Weight of a table pixel beside a foreground pixel: most of an image is table."""
 
 
-def turned_view(scene: Scene, poses: jax.Array, center: jax.Array, angle: jax.Array, *, pixels: int) -> Observation:
-    """The observation of a view centred on `center [2]` (metres) with its columns along `angle []`."""
+def turned_view(scene: Scene, poses: Array, center: Array, angle: Array, *, pixels: int) -> Observation:
+    """Return the observation of a view centred on `center [2]` (metres) with its columns along `angle []`."""
     shift = -geometry.rotate2d(center, -angle)
     return render.render(scene, geometry.transform_poses(poses, -angle, shift), pixels=pixels)
 
 
 def _flips(key: jax.Array, images: jax.Array, *others: jax.Array) -> list[jax.Array]:
-    """Each example mirrored along its rows and its columns, or not: a grasp's mirror images are grasps."""
+    """Mirror examples at random along rows and columns, which is allowed because mirror images of grasps are grasps."""
     for axis, axis_key in zip((1, 2), jax.random.split(key), strict=True):
         flip = jax.random.bernoulli(axis_key, 0.5, (images.shape[0],))
         both = [images, *others]
@@ -50,7 +50,7 @@ def _flips(key: jax.Array, images: jax.Array, *others: jax.Array) -> list[jax.Ar
 
 
 class PretrainTask:
-    """Every pixel of a randomly turned image against `fingers.geometric_labels`: no physics."""
+    """Task of learning `fingers.geometric_labels` of every pixel of randomly turned images; it takes no physics."""
 
     network = "grasp"
 
@@ -66,7 +66,7 @@ class PretrainTask:
         return structs.take(self.train_set, index)
 
     def views(self, settled: SettledScene, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Images `[B, V, V, 4]`, labels `[B, V, V]` and weights `[B, V, V]` of random views."""
+        """Return images `[B, V, V, 4]`, labels `[B, V, V]` and weights `[B, V, V]` of random views."""
 
         def one(args: tuple[Scene, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
             scene, poses, k = args
@@ -75,7 +75,7 @@ class PretrainTask:
             center = jax.random.uniform(shift_key, (2,), minval=-0.08, maxval=0.08)
             seen = turned_view(scene, poses, center, angle, pixels=PRETRAIN_VIEW)
             weight = jnp.where(seen.label >= 0, 1.0, TABLE_WEIGHT)
-            return render.rgbd(seen), fingers.geometric_labels(seen.height), weight
+            return render.rgbd(seen), fingers.geometric_labels(jnp.asarray(seen.height)), weight
 
         return jax.lax.map(one, (settled.scene, settled.poses, jax.random.split(key, settled.fault.shape[0])))
 
@@ -100,17 +100,17 @@ class PretrainTask:
 
 @flax.struct.dataclass
 class Window(Pytree):
-    """What one executed action teaches; a grasp's closing axis, or a push, lies along the columns."""
+    """One executed action as an example; the closing axis of a grasp, or a push, lies along the columns."""
 
     height: Array  # [W, W] float16 metres; the action is at the centre of pixel (W / 2, W / 2)
     label: Array  # [W, W] int8: object slot, ABSENT on the table
     color: Array  # [N, 3] in [0, 1], of the objects
-    target: Array  # [] float32: 1 if a grasp held, 0 if not; or another measure of what came of it
+    target: Array  # [] float32: 1 if a grasp held, 0 if not; or another measure of the result
 
 
 @functools.partial(jax.jit, static_argnames="pixels")
 def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
-    """Windows `[B]` of episodes `[B]`."""
+    """Return windows `[B]` of episodes `[B]`."""
 
     def one(episode: GraspEpisode) -> Window:
         half = geometry.rotate2d(jnp.full(2, WORKSPACE.pixel / 2), episode.grasp.angle)
@@ -124,17 +124,17 @@ def _windows(episodes: GraspEpisode, *, pixels: int) -> Window:
 
 
 def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
-    """Windows `[B]`, `pixels` a side, of episodes `[B]`; numpy."""
+    """Return windows `[B]`, `pixels` a side, of episodes `[B]`, as NumPy arrays."""
     return jax.device_get(batching.in_batches(functools.partial(_windows, pixels=pixels), episodes))
 
 
 def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array:
-    """Cross entropy of executed grasps `[B]`: each moved by some pixels, mirrored or not, objects in new colours."""
+    """Return the cross entropy of executed grasps `[B]`, each shifted, mirrored or not, with objects in new colours."""
     phase_key, flip_key, color_key = jax.random.split(key, 3)
     palette = jnp.asarray(shapes.COLORS_RGB, jnp.float32) / 255
     drawn = jax.random.randint(color_key, batch.color.shape[:2], 0, len(palette))
-    batch = batch.replace(color=palette[drawn])  # what an object is like is not in its colour
-    images, pixel = view(batch, jax.random.randint(phase_key, (len(batch.target), 2), 0, 2 * PHASE))
+    batch = batch.replace(color=palette[drawn])  # colour must not tell the network what an object is
+    images, pixel = view(batch, jax.random.randint(phase_key, (len(batch.target), 2), 0, 2 * SHIFT_PIXELS))
     mask = jnp.zeros(images.shape[:3]).at[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]].set(1.0)
     images, mask = _flips(flip_key, images, mask)
     logits = (model(images) * mask).sum((1, 2))
@@ -142,9 +142,17 @@ def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array
 
 
 def view(batch: Window, begin: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Images `[B, W - 2 PHASE, W - 2 PHASE, 4]` whose first pixel is `begin [B, 2]`; executed pixels `[B, 2]`."""
+    """Cut images `[B, S, S, 4]` out of windows, S = W - 2 SHIFT_PIXELS.
+
+    Args:
+      batch: windows `[B]`, W pixels a side.
+      begin: `[B, 2]` first pixel of each image.
+
+    Returns:
+      The images, and the executed pixels in them `[B, 2]`.
+    """
     wide = batch.height.shape[-1]
-    side = wide - 2 * PHASE
+    side = wide - 2 * SHIFT_PIXELS
 
     def one(window: Window, corner: jax.Array) -> jax.Array:
         cut = functools.partial(jax.lax.dynamic_slice, start_indices=corner, slice_sizes=(side, side))
@@ -156,9 +164,10 @@ def view(batch: Window, begin: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 class GraspTask:
-    """Outcomes of executed grasps: loss at the executed pixel only, so only a window around it is rendered.
+    """Task of learning the outcomes of executed grasps, by the loss at the executed pixel only.
 
-    Windows of the `compact` network are rendered once and kept, 40 KB a grasp.
+    So only a window around that pixel is rendered; windows of the `compact` network are rendered once and kept (40 KB a
+    grasp).
     """
 
     network = "grasp"
@@ -167,7 +176,7 @@ class GraspTask:
         """Load data sets.
 
         Args:
-          data: folders of grasp episodes; of each, the last tenth is held out.
+          data: folders of grasp episodes; the last tenth of each is held out.
           config: architecture.
 
         Raises:
@@ -183,11 +192,11 @@ class GraspTask:
         self.fingerprint = ":".join(fingerprint for _, fingerprint in loaded)
         self.size = self.examples = len(self.train_set.fault)
         self.network_config = config
-        self.window = WINDOWS[config.preset] + 2 * PHASE
+        self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
         self._kept: dict[str, Window] = {}
 
     def prepare(self, episodes: GraspEpisode) -> Window:
-        """Windows `[B]` of episodes `[B]`, numpy."""
+        """Return windows `[B]` of episodes `[B]` as NumPy arrays."""
         return windows(episodes, pixels=self.window)
 
     def fetch(self, index: np.ndarray) -> Window:
@@ -228,15 +237,15 @@ class GraspTask:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _measure(graph: Any, state: Any, batch: Window, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Weighted sums over grasps `[B]` of the loss and of how many are told right."""
-    images, pixel = view(batch, jnp.full((len(batch.target), 2), PHASE))
+    """Return weighted sums over grasps `[B]` of the loss and of how many are classified correctly."""
+    images, pixel = view(batch, jnp.full((len(batch.target), 2), SHIFT_PIXELS))
     logits = nnx.merge(graph, state)(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
     loss = losses.score_loss(logits, batch.target, weight) * weight.sum()
     return loss, ((logits > 0) == (batch.target > 0.5)) @ weight
 
 
 def _widened(episodes: GraspEpisode, slots: int) -> GraspEpisode:
-    """Episodes `[B, N]` as `[B, slots]`, so that data sets of different numbers of objects can be joined."""
+    """Return episodes `[B, N]` as `[B, slots]`, so that data sets of different numbers of objects can be joined."""
     more = slots - episodes.scene.shape.shape[1]
     if not more:
         return episodes

@@ -1,4 +1,4 @@
-"""The training loop, top to bottom; what is trained arrives as a `Task`."""
+"""The training loop, from top to bottom; the data, the loss and the network are given as a `Task`."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ import grain  # noqa: E402
 
 
 class Taught(Protocol):
-    """What an optimizer step needs of a task."""
+    """The part of a task that an optimizer step needs."""
 
     def loss(self, model: nnx.Module, batch: Any, key: jax.Array) -> jax.Array:
-        """Loss of a batch of examples, inside jit."""
+        """Return the loss of a batch of examples, inside jit."""
         ...
 
 
@@ -44,16 +44,16 @@ class Task(Taught, Protocol):
     fingerprint: str  # of the data
 
     def fetch(self, index: np.ndarray) -> Any:
-        """The examples `index [B]`."""
+        """Return the examples `index [B]`."""
         ...
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
-        """Measures on examples that are not trained on."""
+        """Return measures on examples that are held out."""
         ...
 
 
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
-    """The optimizer of a run, its schedule included."""
+    """Return the optimizer of a run, with its schedule."""
     if config.optimizer == "sgd":
         return optax.chain(
             optax.add_decayed_weights(config.weight_decay), optax.sgd(config.learning_rate, momentum=0.9)
@@ -72,13 +72,16 @@ def constant_adamw(config: OnlineConfig | BaselineConfig) -> optax.GradientTrans
 
 
 def _split(model: nnx.Module) -> tuple[Any, Any, Any]:
-    """Graph, parameters, everything else (statistics, random streams)."""
+    """Split a network into its graph, its parameters and everything else (statistics, random streams)."""
     parts: Any = nnx.split(model, nnx.Param, ...)
     return parts
 
 
 def make_step(task: Taught, graph: Any, optimizer: optax.GradientTransformation) -> Callable[..., Any]:
-    """`(params, rest, moments, batch, key) -> (params, rest, moments, loss)`, jitted; the first three are donated."""
+    """Return the jitted step `(params, rest, moments, batch, key) -> (params, rest, moments, loss)`.
+
+    The first three arguments are donated.
+    """
 
     @functools.partial(jax.jit, donate_argnums=(0, 1, 2))
     def step(params: Any, rest: Any, moments: Any, batch: Any, key: jax.Array) -> Any:
@@ -96,7 +99,7 @@ def make_step(task: Taught, graph: Any, optimizer: optax.GradientTransformation)
 
 
 def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Module | None = None) -> dict[str, float]:
-    """Train, or go on training, in the folder `out`.
+    """Train, or continue to train, in the folder `out`.
 
     Args:
       task: what to learn.
@@ -155,6 +158,7 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
 
 
 def _check(config: TrainConfig, out: pathlib.Path) -> None:
+    """Raise UserError where an option is out of its range or `out` cannot be written."""
     console.require_positive(
         steps=config.steps,
         batch=config.batch,
@@ -168,7 +172,7 @@ def _check(config: TrainConfig, out: pathlib.Path) -> None:
 
 
 def _resume(out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTransformation) -> tuple[Any, int]:
-    """Optimizer state and step to begin with; the weights of an earlier part of the run go into `model`."""
+    """Return the optimizer's state and the step to begin with; earlier weights of the run are put into `model`."""
     moments = optimizer.init(_split(model)[1])
     found = checkpoint.newest(out)
     if found is None:
@@ -179,7 +183,7 @@ def _resume(out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTrans
 
 
 def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> dict[str, Any]:
-    """What a run is a function of; flat, so that a difference can be named."""
+    """Return everything that determines the run; a flat dictionary, so that a difference can be named."""
     start = None if initial is None else checkpoint.digest(initial)
     network = {f"network.{k}": v for k, v in dataclasses.asdict(task.network_config).items()}
     data = {"network": task.network, "initial_weights": start, "data": task.fingerprint}
@@ -187,7 +191,7 @@ def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> di
 
 
 def _step_of(line: str) -> float:
-    """The step of a line of `metrics.jsonl`; infinite if a hard stop cut the line."""
+    """Return the step of a line of `metrics.jsonl`; infinite if a hard stop cut the line."""
     try:
         return float(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):
@@ -195,7 +199,7 @@ def _step_of(line: str) -> float:
 
 
 class _Log:
-    """`metrics.jsonl` and TensorBoard events; lines past the restored step are dropped."""
+    """Writer of `metrics.jsonl` and TensorBoard events; lines past the restored step are dropped."""
 
     def __init__(self, out: pathlib.Path, begin: int) -> None:
         self.path = out / "metrics.jsonl"

@@ -1,4 +1,4 @@
-"""GN learns while it grasps: act greedily on several tables at once, learn from each outcome (the paper's way)."""
+"""Learning of GN while it grasps: act greedily on several tables at once, learn from each outcome (as in the paper)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from dipn_jax.world.scenes import SceneConfig
 
 from . import tables
 from .configs import OnlineConfig
-from .grasp import PHASE, WINDOWS, Window, executed_loss, windows
+from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
 from .loop import constant_adamw, make_step
 from .rounds import Run
 from .tables import Tables
 
-RECENT = 50
+RECENT_GRASPS = 50
 """The number of last grasps over which success is counted."""
 
 
@@ -43,7 +43,7 @@ class State:
     moments: Any  # of the optimizer
     tables: Tables
     round: int = 0
-    seen: list[Window] = dataclasses.field(default_factory=list)  # what was tried, a batch a round
+    seen: list[Window] = dataclasses.field(default_factory=list)  # executed grasps, a batch for each round
     success: list[bool] = dataclasses.field(default_factory=list)  # in the order of the grasps
 
 
@@ -55,8 +55,8 @@ def learn(
     Args:
       model: network to begin with; a compact one.
       engine: physics.
-      scenes: what is grasped.
-      config: how.
+      scenes: distribution of fresh tables.
+      config: how to learn.
       out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
 
     Returns:
@@ -77,7 +77,10 @@ def learn(
         return {name: ended[name] for name in ("success", "success_recent")}
     state = _play(run, model, engine, scenes, config)
     nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
-    result = {"success": float(np.mean(state.success)), "success_recent": float(np.mean(state.success[-RECENT:]))}
+    result = {
+        "success": float(np.mean(state.success)),
+        "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
+    }
     extra = {"seed": config.seed, "examples": len(state.success), **result}
     run.finish(model, len(state.success), network="grasp", config=model.config, extra=extra)
     return result
@@ -96,9 +99,9 @@ def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config
         return State(weights, jax.device_get(optimizer.init(weights)), begun)
 
     def act(state: State) -> str:
-        _grasp(state, functools.partial(_choose, graph, state.params, rest), engine, scenes)
+        _grasp(state, functools.partial(_best_grasps, graph, state.params, rest), engine, scenes)
         state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
-        return f"{np.mean(state.success[-RECENT:]):.2f} of the last {RECENT} held"
+        return f"{np.mean(state.success[-RECENT_GRASPS:]):.2f} of the last {RECENT_GRASPS} held"
 
     log = functools.partial(_log, run.out, config)
     return run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
@@ -113,8 +116,8 @@ class _Outcomes:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _choose(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) -> Grasp:
-    """The best grasp on each of the tables `[T]`."""
+def _best_grasps(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) -> Grasp:
+    """Return the best grasp on each of the tables `[T]`."""
     network = nnx.merge(graph, params, rest)
     network.eval()
 
@@ -126,10 +129,10 @@ def _choose(graph: Any, params: Any, rest: Any, scene: Scene, poses: jax.Array) 
     return jax.lax.map(one, (scene, poses))
 
 
-def _grasp(state: State, choose: Callable[..., Grasp], engine: Engine, scenes: SceneConfig) -> None:
-    """One grasp on every table; what is held is taken away; tables that are empty, or stuck, are set anew."""
+def _grasp(state: State, best_grasps: Callable[..., Grasp], engine: Engine, scenes: SceneConfig) -> None:
+    """Grasp once on every table, take away what is held, and replace tables that are empty or stuck."""
     before = state.tables
-    taken = jax.device_get(choose(before.scene, before.poses))
+    taken = jax.device_get(best_grasps(before.scene, before.poses))
     scene, poses, held, fault = clutter.grasp_away(engine, before.scene, before.poses, taken)
     good = Fault.usable(fault)
     success = np.asarray(held.any(1))
@@ -137,13 +140,13 @@ def _grasp(state: State, choose: Callable[..., Grasp], engine: Engine, scenes: S
         scene=before.scene, poses=before.poses, after=poses, grasp=taken, held=held, success=success, fault=fault
     )
     if good.any():
-        state.seen.append(windows(structs.take(tried, good), pixels=WINDOWS["compact"] + 2 * PHASE))
+        state.seen.append(windows(structs.take(tried, good), pixels=WINDOW_PIXELS["compact"] + 2 * SHIFT_PIXELS))
     state.success += [bool(one) for one in np.asarray(success)[good]]
     state.tables.step(scene, poses, success, good, engine, scenes)
 
 
 def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineConfig, key: jax.Array) -> tuple[Any, Any]:
-    """Some optimizer steps on everything tried so far."""
+    """Take some optimizer steps on everything tried so far."""
     if not state.seen:
         return state.params, state.moments
     seen = structs.concatenate(state.seen)
@@ -160,5 +163,5 @@ def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineCon
 def _log(out: pathlib.Path, config: OnlineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of grasps after each round, and success over the last of them."""
     counts = range(config.tables, len(state.success) + 1, config.tables)
-    rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT) : n]))} for n in counts]
+    rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT_GRASPS) : n]))} for n in counts]
     files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())

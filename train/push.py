@@ -1,4 +1,4 @@
-"""DIPN's task: motions of every object at any recorded distance of a push."""
+"""DIPN's task: to predict the motions of all objects at any recorded distance of a push."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from .split import split
 
 @flax.struct.dataclass
 class Example(Pytree):
-    """What one push teaches; K distances."""
+    """One push as an example, at K distances."""
 
     inputs: PushInput
     target: Array  # [N, K, 3]: pixels, pixels, degrees, push frame
-    taught: Array  # [N, K] bool: masks of objects of which the push says where they go, distances that it reaches
+    taught: Array  # [N, K] bool: the object counts (its mask belongs to a real one), and the push reaches the distance
 
 
 class PushTask:
-    """Episodes in, motions out. A tenth of the episodes, the last ones, is held out for the learning curve."""
+    """Task of learning motions from push episodes; their last tenth is held out for the learning curve."""
 
     network = "dipn"
 
@@ -54,7 +54,7 @@ class PushTask:
         Args:
           data: folder of push episodes.
           config: architecture.
-          limit: learn from the first so many episodes only; what is held out stays the same.
+          limit: learn from this number of episodes only, the first ones; the same ones are held out.
           centimetres: distances learnt, each 1 to 10.
           without: leave out scenes with an object of these classes (`shapes.CLASSES`).
           found: masks are found in the image by `segment`, not taken from the simulator.
@@ -100,7 +100,7 @@ class PushTask:
         return structs.take(self._kept, index)
 
     def prepare(self, episodes: PushEpisode) -> Example:
-        """Examples `[B]` of episodes `[B]`; rendered, and moved into the push frame, on the device."""
+        """Return examples `[B]` of episodes `[B]`; rendered, and moved into the push frame, on the device."""
         label, height, color = _look(episodes)
         counted = np.ones(episodes.scene.shape.shape, bool)
         if self.found:
@@ -111,7 +111,7 @@ class PushTask:
         return _examples(label, height, episodes, counted, self.centimetres, slots=self.slots, view=view)
 
     def _prepare_all(self, episodes: PushEpisode) -> Example:
-        """Examples of a whole set, in memory on the host: about 20 KB a push of seven objects."""
+        """Return examples of a whole set, in memory on the host: about 20 KB a push of seven objects."""
         parts, count = [], len(episodes.fault)
         with console.Progress("render examples", count, unit="pushes") as progress:
             for begin in range(0, count, batching.BATCH):
@@ -124,7 +124,7 @@ class PushTask:
     def loss(self, model: nnx.Module, batch: Example, key: jax.Array) -> jax.Array:
         """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored.
 
-        `compact` is taught every distance by every example, `paper`, which has one output, a random one.
+        `compact` learns all distances from every example; `paper`, which has one output, learns a random one.
         """
         count = batch.taught.shape[0]
         distance_key, mirror_key = jax.random.split(key)
@@ -138,7 +138,7 @@ class PushTask:
             taught = jnp.take_along_axis(taught, drawn[:, None], 2)
         flipped = jax.random.bernoulli(mirror_key, 0.5, (count,))
 
-        def pick(mirrored: jax.Array, seen: jax.Array) -> jax.Array:
+        def pick(mirrored: Array, seen: Array) -> jax.Array:
             return jnp.where(flipped.reshape(-1, *[1] * (seen.ndim - 1)), mirrored, seen)
 
         inputs = jax.tree.map(pick, push_frame.mirror(inputs), inputs)
@@ -166,7 +166,7 @@ class PushTask:
 
 
 def _single(inputs: PushInput) -> PushInput:
-    """Crops in single precision, in which they are not kept."""
+    """Return inputs whose crops are in single precision; they are stored in half precision."""
     return inputs.replace(crops=inputs.crops.astype(jnp.float32))
 
 
@@ -174,7 +174,7 @@ def _single(inputs: PushInput) -> PushInput:
 def _measure(
     graph: Any, state: Any, batch: Example, centimetres: jax.Array, weight: jax.Array
 ) -> tuple[jax.Array, ...]:
-    """Loss, error (mm) and number of moved objects at the largest distance of each push."""
+    """Return loss, error (mm) and number of moved objects at the largest distance of each push."""
     inputs = _single(batch.inputs)
     farthest = jnp.where(batch.taught.any(1), centimetres, 0).argmax(-1)[:, None]
     predicted = nnx.merge(graph, state)(inputs, centimetres[farthest] * 0.01)
@@ -189,7 +189,7 @@ def _measure(
 
 @jax.jit
 def _look(episodes: PushEpisode) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Labels, heights and colours `[B, ...]` before the pushes."""
+    """Return labels, heights and colours `[B, ...]` before the pushes."""
 
     def one(episode: PushEpisode) -> tuple[jax.Array, jax.Array, jax.Array]:
         seen = render.render(episode.scene, episode.poses[0])
@@ -209,7 +209,7 @@ def _examples(
     slots: int,
     view: View,
 ) -> Example:
-    """Examples `[B]` of what is seen `[B, H, W]` before pushes; `counted [B, N]` masks teach something."""
+    """Return examples `[B]` of labels and heights `[B, H, W]` before pushes; masks `counted [B, N]` are learnt from."""
 
     def one(label: jax.Array, height: jax.Array, episode: PushEpisode, counted: jax.Array) -> Example:
         inputs, centers = push_frame.push_input(label, height, episode.push, slots=slots, view=view)

@@ -1,4 +1,4 @@
-"""A run whose work is rounds of acting: it goes on where it stopped, and ends with one checkpoint."""
+"""A run that consists of rounds of acting: it continues where it stopped, and ends with one checkpoint."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dipn_jax.storage import checkpoint, resume
 
 
 class State(Protocol):
-    """Everything that a run is at a moment; it pickles."""
+    """State of a run after some rounds; it can be pickled."""
 
     round: int
 
@@ -29,7 +29,7 @@ class Run:
 
         Args:
           out: folder: `config.json`, `checkpoints/`, and `partial.pickle` until the end.
-          identity: what the run is a function of.
+          identity: everything that determines the result of the run.
 
         Raises:
           UserError: the folder holds another run.
@@ -39,7 +39,7 @@ class Run:
         self._partial = resume.Partial(out, identity)
 
     def ended(self) -> dict[str, Any] | None:
-        """What was saved at the end; None if that has not come."""
+        """Return what was saved at the end; None if the run has not ended."""
         found = checkpoint.newest(self.out)
         return found[1] if found else None
 
@@ -52,14 +52,14 @@ class Run:
         what: str,
         log: Callable[[S], None] = lambda _: None,
     ) -> S:
-        """Act until `total` rounds were made.
+        """Act until `total` rounds are done.
 
         Args:
           fresh: the state to begin with.
-          act: one round, in place; what there is to say of it.
-          total: rounds.
+          act: does one round in place; returns a note for the progress line.
+          total: number of rounds.
           what: title of the progress.
-          log: writes what the rounds so far gave; a function of the state alone.
+          log: writes the results of the rounds so far; it depends on the state alone.
         """
         state: S | None = self._partial.load(None)
         if state is None:
@@ -71,7 +71,7 @@ class Run:
                 self._partial.save(state)
                 log(state)
                 progress.advance(1, note)
-        log(state)  # again, should the last round have been cut short before it
+        log(state)  # again, in case the run was interrupted between saving and logging its last round
         return state
 
     def finish(self, model: nnx.Module, step: int, *, network: str, config: Any, extra: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Which examples are held out for the learning curve."""
+"""Split of a data set: which examples are held out for the learning curve."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from dipn_jax.errors import UserError
 
 
 def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
-    """Training examples, and about the last tenth, 1,000 at most; no scene is on both sides.
+    """Return the training examples, and about the last tenth, 1,000 at most, which is held out.
+
+    No scene is on both sides.
 
     Args:
-      episodes: a struct with `scene` and a leading `[B]`; the actions tried on one scene stand together.
-      data: where they came from, for the error.
+      episodes: a struct with `scene` and a leading `[B]`; the actions tried on one scene are neighbours.
+      data: folder that they are from, for the error message.
 
     Raises:
-      UserError: there are not two scenes.
+      UserError: there are fewer than two scenes.
     """
     size = np.asarray(episodes.scene.size)
     begins = np.flatnonzero((size[1:] != size[:-1]).any((1, 2))) + 1  # first examples of the second, third, ... scene

@@ -1,4 +1,4 @@
-"""Tables that a learner acts on side by side; those that are done with are set anew."""
+"""Tables that a learner acts on side by side; a table that is finished is replaced by a fresh one."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
 
-PATIENCE = 3
-"""Actions without effect in a row before a table is set anew."""
+IDLE_LIMIT = 3
+"""Actions without effect in a row after which a table is replaced."""
 
 
 @dataclasses.dataclass
 class Tables:
-    """T tables; everything about them that an interrupted run has to keep."""
+    """T tables, with everything about them that an interrupted run has to keep."""
 
     scene: Scene  # [T, N], numpy
     poses: np.ndarray  # [T, N, 7]
-    spare: SettledScene  # tables to come
+    spare: SettledScene  # tables that replace others later
     seed: int
     drawn: int = 1  # batches of tables that were drawn
     idle: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))  # [T] actions without effect
@@ -33,22 +33,22 @@ class Tables:
     def step(
         self, scene: Scene, poses: np.ndarray, effect: np.ndarray, good: np.ndarray, engine: Engine, config: SceneConfig
     ) -> np.ndarray:
-        """Go on from what an action left; tables that went wrong, are empty, spilt or stuck are set anew.
+        """Continue after an action; tables that are faulty, empty, spilt or stuck are replaced by fresh ones.
 
         Args:
           scene: `[T, N]` afterwards.
           poses: `[T, N, 7]` afterwards.
           effect: `[T]` bool: the action did something.
-          good: `[T]` bool: its simulation can be believed.
+          good: `[T]` bool: its simulation went without a fault.
           engine: physics, for more tables.
-          config: what they are made of.
+          config: what tables are made of.
 
         Returns:
-          Which were set anew `[T]` bool.
+          Which tables were replaced `[T]` bool.
         """
         idle = np.where(effect, 0, self.idle + 1)
         outside = ((np.abs(poses[..., :2]) > WORKSPACE.half).any(-1) & (scene.shape >= 0)).any(1)
-        again = ~good | outside | (idle >= PATIENCE) | ~(scene.shape >= 0).any(1)
+        again = ~good | outside | (idle >= IDLE_LIMIT) | ~(scene.shape >= 0).any(1)
         over = np.flatnonzero(again)
         while len(self.spare.fault) < len(over):
             self.spare = structs.concatenate([self.spare, _draw(engine, config, self.seed, self.drawn, len(good))])
@@ -61,18 +61,19 @@ class Tables:
 
 
 def begin(engine: Engine, config: SceneConfig, *, count: int, seed: int) -> Tables:
-    """`count` fresh tables."""
+    """Return `count` fresh tables."""
     drawn = _draw(engine, config, seed, 0, count)
     first, spare = structs.take(drawn, slice(0, count)), structs.take(drawn, slice(count, None))
     return Tables(first.scene, first.poses, spare, seed, idle=np.zeros(count, int))
 
 
 def _draw(engine: Engine, config: SceneConfig, seed: int, batch: int, count: int) -> SettledScene:
-    """Twice as many tables as are in play."""
+    """Draw `2 * count` tables: twice the number that is acted on."""
     return clutter.settled_scenes(jax.random.fold_in(jax.random.key(seed), batch), engine, config, 2 * count)
 
 
 def _replaced(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Return `old` with its rows `where` replaced by `new`."""
     result = np.array(old)
     result[where] = new
     return result

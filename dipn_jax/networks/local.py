@@ -1,9 +1,9 @@
-"""What all grasps are worth on many images that differ from the present one in places: a rough look, then a close one.
+"""Grasp scores of many images that differ from the present one in places: first rough ones, then exact ones.
 
 Three facts make it fast. The mean over all score maps is a sum over the cells that the network fills, so it changes by
 what these cells change. The `compact` network is local: cells far from anything that moved keep their score. And only
-the best images matter: which these may be is told from every second rotation, and from windows whose surroundings are
-cut off; which of these they are from the other rotations, too; those few are then scored whole.
+the best images matter: candidates for these are found from every second rotation, and from windows whose surroundings
+are cut off; the other rotations narrow them down; those that remain are then scored whole.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.networks.grasp import (
-    BLOCK,
-    SCALE,
-    VIEW,
+    CELL_PIXELS,
+    INPUT_SCALE,
+    VIEW_PIXELS,
     GraspNet,
     flat_pixels,
     score_cells,
@@ -30,60 +31,70 @@ from dipn_jax.networks.grasp import (
 from dipn_jax.sight import fingers
 from dipn_jax.workspace import ROTATIONS
 
-FEW = 8
-"""Images that are scored whole without a rough look."""
+SCORED_WHOLE = 8
+"""Images that are scored whole without a rough score, if no more are wanted."""
 FINALISTS = 4
-"""Images that are scored whole after one."""
-SECOND = 16
-"""Images that get a second rough look. On 24 packed rows of 3 to 8 the first, at half of the rotations, was off by a
-fifth of what images differ by, and once the best one came ninth; both together by 3 %, and it was first or second."""
-TURNS = (tuple(range(0, ROTATIONS // 2, 2)), tuple(range(1, ROTATIONS // 2, 2)))
-"""Rotations of the first and of the second rough look."""
-FELT = (36, 20)
-"""Pixels across which a change is felt: along the closing axis (fingers begin 28 away), and across it."""
-SEEN = 8
-"""Pixels beyond those which a rough score looks at; the network sees 48."""
-SIDES = (20, 28, 36, 44, 56, 80)
-"""Cells of the windows' rows; even, the network has a stride of two of them. The compiled program holds each size."""
-_CELLS = VIEW // BLOCK
-_WIDER = 2 * (FELT[0] - FELT[1]) // BLOCK
+"""Images that are scored whole after the rough scores."""
+SECOND_LOOKS = 16
+"""Images that get the second rough score. Measured on 24 packed rows of 3 to 8 objects: the first score, at half of the
+rotations, was off by a fifth of the differences between images, and ranked the best image ninth once; both scores
+together were off by 3 %, and ranked it first or second."""
+LOOK_TURNS = (tuple(range(0, ROTATIONS // 2, 2)), tuple(range(1, ROTATIONS // 2, 2)))
+"""Rotations of the first and of the second rough score."""
+FELT_PIXELS = (36, 20)
+"""Pixels from a change within which scores change: along the closing axis (fingers begin 28 away), and across it."""
+SEEN_PIXELS = 8
+"""Pixels around those that a rough score takes into account; the network sees 48."""
+WINDOW_CELLS = (20, 28, 36, 44, 56, 80)
+"""Possible rows of a window, in cells; even, because the network has a stride of two. Each size is compiled."""
+_VIEW_CELLS = VIEW_PIXELS // CELL_PIXELS
+"""Cells along a side of a view."""
+_WIDER_CELLS = 2 * (FELT_PIXELS[0] - FELT_PIXELS[1]) // CELL_PIXELS
+"""Cells by which a window has more columns than rows."""
 
 
 @functools.cache
-def _weights() -> np.ndarray:
-    """How much each pixel of each cell `[8, 80, 80, 16]` counts in the mean over all score maps."""
+def _weights() -> Float[np.ndarray, "8 80 80 16"]:
+    """Return the weight of each pixel of each cell in the mean over all score maps."""
     half = ROTATIONS // 2
     _, back = turning_tables(half)
-    count = np.bincount(back.reshape(-1), minlength=half * VIEW**2 + 1)[: half * VIEW**2]
-    return (count / back.size).astype(np.float32).reshape(half, _CELLS, _CELLS, BLOCK**2)
+    count = np.bincount(back.reshape(-1), minlength=half * VIEW_PIXELS**2 + 1)[: half * VIEW_PIXELS**2]
+    return (count / back.size).astype(np.float32).reshape(half, _VIEW_CELLS, _VIEW_CELLS, CELL_PIXELS**2)
 
 
-def _extents(changed: jax.Array, turns: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """Least (column, row) of the pixels `changed [H, W]` in the turned views, and their extent: `[T, 2]` pixels."""
+def _extents(
+    changed: Bool[jax.Array, "H W"], turns: Int[np.ndarray, " T"]
+) -> tuple[Float[jax.Array, "T 2"], Float[jax.Array, "T 2"]]:
+    """Return the least (column, row) of pixels `changed` in turned views, and their extent, in pixels."""
     size, far = changed.shape[0], 1e4
     place = jnp.arange(size) - (size - 1) / 2
     ends = jnp.stack([jnp.where(changed, place, far).min(1), jnp.where(changed, place, -far).max(1)])
     points = jnp.stack([ends.reshape(-1), jnp.tile(place, 2)], -1)
     there = jnp.tile(changed.any(1), 2)[:, None]
     angles = turns.astype(np.float32) * np.float32(2 * np.pi / ROTATIONS)
-    turned = jax.vmap(lambda a: geometry.rotate2d(points, -a))(angles) + (VIEW - 1) / 2
+    turned = jax.vmap(lambda a: geometry.rotate2d(points, -a))(angles) + (VIEW_PIXELS - 1) / 2
     least = jnp.where(there, turned, far).min(1)
     return least, jnp.maximum(jnp.where(there, turned, -far).max(1) - least, 0.0)
 
 
-def _felt(cells: jax.Array, least: jax.Array, extent: jax.Array, axis: int) -> jax.Array:
-    """Which columns (axis 0) or rows (axis 1) `cells [T, S]` feel a change."""
-    low, high = least[:, axis, None] - FELT[axis], least[:, axis, None] + extent[:, axis, None] + FELT[axis]
-    return (cells >= low // BLOCK) & (cells <= high // BLOCK)
+def _felt(
+    cells: Int[jax.Array, "T S"], least: Float[jax.Array, "T 2"], extent: Float[jax.Array, "T 2"], axis: int
+) -> Bool[jax.Array, "T S"]:
+    """Return which columns (axis 0) or rows (axis 1) `cells` have scores that a change alters."""
+    low, high = (
+        least[:, axis, None] - FELT_PIXELS[axis],
+        least[:, axis, None] + extent[:, axis, None] + FELT_PIXELS[axis],
+    )
+    return (cells >= low // CELL_PIXELS) & (cells <= high // CELL_PIXELS)
 
 
-def _scores(logits: jax.Array, height: jax.Array) -> jax.Array:
-    """Scores of pixels of normalized `height`; 0 on the table."""
-    return jnp.where(height * SCALE[3] > fingers.EMPTY_HEIGHT, nnx.sigmoid(logits), 0.0)
+def _scores(logits: Float[jax.Array, "*b"], height: Float[jax.Array, "*b"]) -> Float[jax.Array, "*b"]:
+    """Return the scores of pixels of normalized `height`; 0 on the table."""
+    return jnp.where(height * INPUT_SCALE[3] > fingers.EMPTY_HEIGHT, nnx.sigmoid(logits), 0.0)
 
 
-def scores_now(network: GraspNet, now: jax.Array) -> jax.Array:
-    """Scores of the cells of all turned views of an image `[224, 224, 4]`: `[8, 80, 80, 16]`."""
+def scores_now(network: GraspNet, now: Float[jax.Array, "224 224 4"]) -> Float[jax.Array, "8 80 80 16"]:
+    """Return scores of the cells of all turned views of an image."""
     half = ROTATIONS // 2
     there, _ = turning_tables(half)
     return _scores(score_cells(network, now, half), flat_pixels(now)[there][..., 3])
@@ -91,21 +102,21 @@ def scores_now(network: GraspNet, now: jax.Array) -> jax.Array:
 
 def rough_means(
     network: GraspNet,
-    now: jax.Array,
-    before: jax.Array,
-    images: jax.Array,
-    wanted: jax.Array,
+    now: Float[jax.Array, "224 224 4"],
+    before: Float[jax.Array, "8 80 80 16"],
+    images: Float[jax.Array, "P 224 224 4"],
+    wanted: Bool[jax.Array, " P"],
     *,
     turns: tuple[int, ...],
-) -> jax.Array:
-    """About what `turns` contribute to the mean of all scores on each image, less what they do now: `[P]`.
+) -> Float[jax.Array, " P"]:
+    """Return about how much `turns` change the mean of all scores from the present image to each image.
 
     Args:
       network: GN, `compact`, in evaluation mode.
-      now: `[224, 224, 4]`.
-      before: of `scores_now`.
-      images: `[P, 224, 224, 4]`.
-      wanted: `[P]` bool; others get 0.
+      now: the present image.
+      before: result of `scores_now`.
+      images: the others.
+      wanted: which of them; others get 0.
       turns: rotations, of the first eight.
     """
     which = np.array(turns)
@@ -114,9 +125,9 @@ def rough_means(
 
     def again(rows: int, image: jax.Array, least: jax.Array, extent: jax.Array) -> jax.Array:
         """Score windows of `rows` cells around what changed."""
-        shape = np.array([min(rows + _WIDER, _CELLS), rows])
-        at = 2 * jnp.round(((least + extent / 2) / BLOCK - shape / 2) / 2).astype(jnp.int32)
-        at = jnp.clip(at, 0, _CELLS - shape)
+        shape = np.array([min(rows + _WIDER_CELLS, _VIEW_CELLS), rows])
+        at = 2 * jnp.round(((least + extent / 2) / CELL_PIXELS - shape / 2) / 2).astype(jnp.int32)
+        at = jnp.clip(at, 0, _VIEW_CELLS - shape)
 
         def cut(stack: jax.Array | np.ndarray) -> jax.Array:
             part = lambda m, c: jax.lax.dynamic_slice(m, (c[1], c[0], 0), (*shape[::-1], m.shape[-1]))  # noqa: E731
@@ -132,43 +143,50 @@ def rough_means(
         image, want = args
         changed = (image != now).any(-1)
         least, extent = _extents(changed, which)
-        needed = ((extent + 2 * (np.array(FELT) + SEEN)) / BLOCK - np.array([_WIDER, 0])).max()
-        size = jnp.minimum(jnp.searchsorted(jnp.array(SIDES), needed), len(SIDES) - 1)
-        branches: list[Callable[..., jax.Array]] = [functools.partial(again, rows) for rows in SIDES]
+        needed = (
+            (extent + 2 * (np.array(FELT_PIXELS) + SEEN_PIXELS)) / CELL_PIXELS - np.array([_WIDER_CELLS, 0])
+        ).max()
+        size = jnp.minimum(jnp.searchsorted(jnp.array(WINDOW_CELLS), needed), len(WINDOW_CELLS) - 1)
+        branches: list[Callable[..., jax.Array]] = [functools.partial(again, rows) for rows in WINDOW_CELLS]
         branches.insert(0, lambda *_: jnp.zeros(()))
         return jax.lax.switch(jnp.where(want & changed.any(), size + 1, 0), branches, image, least, extent)
 
     return jax.lax.map(one, (images, wanted))
 
 
-def appraise(network: GraspNet, now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and highest of all scores on each image; see `planner.Appraiser`.
+def mean_and_best(
+    network: GraspNet,
+    now: Float[jax.Array, "224 224 4"],
+    images: Float[jax.Array, "P 224 224 4"],
+    wanted: Bool[jax.Array, " P"],
+) -> tuple[Float[jax.Array, " P+1"], Float[jax.Array, " P+1"]]:
+    """Return the mean and the highest of all scores on each image; see `planner.ScoreSummary`.
 
     Args:
       network: GN, `compact`, in evaluation mode.
-      now: `[224, 224, 4]`.
-      images: `[P, 224, 224, 4]`.
-      wanted: `[P]` bool.
+      now: the present image.
+      images: the others.
+      wanted: which of them.
 
     Returns:
-      `[1 + P]` each, of `now` first; as whole images give them for the FINALISTS best (for all if no more than FEW are
-      wanted), the least of theirs for others.
+      Both of `now` first. Exact for the FINALISTS best images (for all if no more than SCORED_WHOLE are wanted); the
+      others get the least of the exact values.
     """
     count = len(wanted)
 
     def shortlist() -> tuple[jax.Array, jax.Array]:
         before = scores_now(network, now)
-        first = rough_means(network, now, before, images, wanted, turns=TURNS[0])
-        _, near = jax.lax.top_k(jnp.where(wanted, first, -jnp.inf), min(SECOND, count))
-        second = rough_means(network, now, before, images[near], wanted[near], turns=TURNS[1])
-        _, best = jax.lax.top_k(jnp.where(wanted[near], first[near] + second, -jnp.inf), min(FEW, count))
-        return near[best], jnp.arange(min(FEW, count)) < FINALISTS
+        first = rough_means(network, now, before, images, wanted, turns=LOOK_TURNS[0])
+        _, near = jax.lax.top_k(jnp.where(wanted, first, -jnp.inf), min(SECOND_LOOKS, count))
+        second = rough_means(network, now, before, images[near], wanted[near], turns=LOOK_TURNS[1])
+        _, best = jax.lax.top_k(jnp.where(wanted[near], first[near] + second, -jnp.inf), min(SCORED_WHOLE, count))
+        return near[best], jnp.arange(min(SCORED_WHOLE, count)) < FINALISTS
 
     def everyone() -> tuple[jax.Array, jax.Array]:
-        _, best = jax.lax.top_k(wanted.astype(jnp.float32), min(FEW, count))
+        _, best = jax.lax.top_k(wanted.astype(jnp.float32), min(SCORED_WHOLE, count))
         return best, wanted[best]
 
-    chosen, close = jax.lax.cond(wanted.sum() > FEW, shortlist, everyone)
+    chosen, close = jax.lax.cond(wanted.sum() > SCORED_WHOLE, shortlist, everyone)
 
     def whole(args: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         image, want = args

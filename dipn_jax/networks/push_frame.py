@@ -1,4 +1,4 @@
-"""What DIPN sees of a push: all is moved rigidly so that the start is at pixel (40, 112) and the push goes to +x."""
+"""DIPN's input: the scene moved rigidly so that a push starts at pixel (40, 112) and goes to +x."""
 
 from __future__ import annotations
 
@@ -11,31 +11,37 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.networks import losses
 from dipn_jax.sight import masks
-from dipn_jax.structs import ABSENT, Push, Pytree
+from dipn_jax.structs import ABSENT, Array, Push, Pytree
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS, WORKSPACE
 
-START_PIXEL = (40.0, 112.0)  # col, row of the start in the push frame
-START_BOX = (40, 100, 65, 124)  # M_p: col, row of the corners of the white box
-CROP = 60  # pixels of an object's mask about its centre
-HEIGHT_UNIT = 0.05  # metres that are 1 in a height channel
-DIRECTIONS = 32
-"""In which outlines are known, evenly from +x toward +y."""
+START_PIXEL = (40.0, 112.0)
+"""Column and row of the start in the push frame."""
+START_BOX = (40, 100, 65, 124)
+"""First column and row, last column and row of the white box in M_p, the map of the push."""
+PAPER_CROP = 60
+"""Pixels along a side of the published crop of an object's mask, about its centre."""
+HEIGHT_UNIT = 0.05
+"""Metres that are 1 in a height channel."""
+OUTLINE_DIRECTIONS = 32
+"""Number of directions in which outlines are known, evenly from +x toward +y."""
 OUTLINE_WINDOW = 96
 """Pixels around a centroid that are searched for an outline: no mask of one object reaches farther."""
-_FAR = 10.0  # metres
+_FAR_AWAY = 10.0
+"""Metres, farther than any pixel."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """What a network is shown."""
+    """Form in which a network is shown a push."""
 
     crop: int  # pixels of a crop's side
     stride: int  # pixels between its samples
-    context: bool  # no maps of the scene, but outlines, and crops that also show others, the sweep and heights
+    context: bool  # outlines, and crops that also show other objects, the sweep and heights, but no maps of the scene
 
     @property
     def crop_side(self) -> int:
@@ -44,36 +50,39 @@ class View:
 
     @property
     def channels(self) -> int:
-        """Of a crop."""
+        """Channels of a crop."""
         return 5 if self.context else 1
 
 
-PAPER = View(CROP, 1, context=False)
-"""As published."""
+PAPER = View(PAPER_CROP, 1, context=False)
+"""View of the published network."""
 COMPACT = View(64, 4, context=True)
-"""Coarse crops for what outlines do not tell: what lies on what, where the others are."""
+"""View of the compact network; its coarse crops show what outlines do not: what lies on what, where others are."""
 
 
 @flax.struct.dataclass
 class PushInput(Pytree):
-    """What DIPN sees of one push, in the push frame; M is 224, C is `View.crop_side`; with `context`, M is 0."""
+    """DIPN's input for one push, in the push frame.
 
-    push_map: jax.Array  # [M, M] float: M_p
-    scene_map: jax.Array  # [M, M] float: M_I, 1 on any object
-    crops: jax.Array  # [N, C, C, 1 or 5] float: M_i about c_i; with `context` others, sweep, own height, others' height
-    outlines: jax.Array  # [N, DIRECTIONS, 2] metres from c_i: see `outlines`; without `context` [N, 0, 2]
-    centers: jax.Array  # [N, 2] c_i, metres from the start
-    present: jax.Array  # [N] bool: objects in sight
+    M is 224, C is `View.crop_side`, F is 1, D is 0; with `context`, M is 0, F is 5, D is OUTLINE_DIRECTIONS.
+    """
+
+    push_map: Float[Array, "*b M M"]  # M_p
+    scene_map: Float[Array, "*b M M"]  # M_I, 1 on any object
+    crops: Float[Array, "*b N C C F"]  # M_i about c_i; with `context` others, sweep, own height, others' height
+    outlines: Float[Array, "*b N D 2"]  # metres from c_i: see `outlines`
+    centers: Float[Array, "*b N 2"]  # c_i, metres from the start
+    present: Bool[Array, "*b N"]  # objects in sight
 
 
-def _sweep(xy: jax.Array, distance: float) -> jax.Array:
-    """1 where the closed gripper passes; `xy [..., 2]` metres from the start, push frame."""
+def _sweep(xy: Float[jax.Array, "*b 2"], distance: float) -> Float[jax.Array, "*b"]:
+    """Return 1 where the closed gripper passes, else 0; `xy` in metres from the start, push frame."""
     inside = (xy[..., 0] >= -GRIPPER.pad_width / 2) & (xy[..., 0] <= distance + GRIPPER.pad_width / 2)
     return (inside & (jnp.abs(xy[..., 1]) <= GRIPPER.push_width / 2)).astype(jnp.float32)
 
 
-def push_ends(distance: jax.Array) -> jax.Array:
-    """Start and end `[..., 4]` of pushes by `distance [...]` metres, in units of the map's side."""
+def push_ends(distance: Float[Array, "*b"]) -> Float[jax.Array, "*b 4"]:
+    """Return start and end of pushes by `distance` metres, in units of the map's side."""
     origin = np.array(START_PIXEL, np.float32) / WORKSPACE.pixels
     end = origin[0] + distance / WORKSPACE.side
     fixed = [jnp.full_like(end, value) for value in (*origin, origin[1])]
@@ -81,19 +90,19 @@ def push_ends(distance: jax.Array) -> jax.Array:
 
 
 def push_input(
-    label: jax.Array, height: jax.Array, push: Push, *, slots: int, view: View
-) -> tuple[PushInput, jax.Array]:
-    """Move what the camera sees into the frame of one push.
+    label: Int[Array, "H W"], height: Float[Array, "H W"], push: Push, *, slots: int, view: View
+) -> tuple[PushInput, Float[jax.Array, "{slots} 2"]]:
+    """Move the camera's maps into the frame of one push.
 
     Args:
-      label: `[224, 224]` int32.
-      height: `[224, 224]` metres; looked at only with `context`.
+      label: object slots, 224 x 224.
+      height: metres, 224 x 224; used only with `context`.
       push: one push.
-      slots: N.
+      slots: number of object slots.
       view: how to sample.
 
     Returns:
-      The network's input, and the mask centroids `[N, 2]` in the workspace (metres).
+      The network's input, and the mask centroids in the workspace (metres).
     """
     centers, area = masks.mask_centers(label, slots)
     start_offset = np.array(START_PIXEL, np.float32)
@@ -131,24 +140,29 @@ def push_input(
     return inputs, centers
 
 
-def directions() -> np.ndarray:
-    """Unit vectors `[DIRECTIONS, 2]`."""
-    angle = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+def directions() -> Float[np.ndarray, "32 2"]:
+    """Return unit vectors of the directions of outlines."""
+    angle = np.arange(OUTLINE_DIRECTIONS) * 2 * np.pi / OUTLINE_DIRECTIONS
     return np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
 
 
-def outlines(label: jax.Array, height: jax.Array, angle: jax.Array, centers: jax.Array) -> jax.Array:
-    """Support functions of the masks: how far each reaches from its centroid, in directions turned by `angle`.
+def outlines(
+    label: Int[Array, "H W"],
+    height: Float[Array, "H W"],
+    angle: Float[Array, ""] | float,
+    centers: Float[Array, "N 2"],
+) -> Float[jax.Array, "N 32 2"]:
+    """Return support functions of the masks: how far each reaches from its centroid, in directions turned by `angle`.
 
     Args:
-      label: `[H, W]` int32.
-      height: `[H, W]` metres.
-      angle: `[]` radians.
-      centers: `[N, 2]` metres, workspace (`masks.mask_centers`).
+      label: object slots.
+      height: metres.
+      angle: radians.
+      centers: metres, workspace (`masks.mask_centers`).
 
     Returns:
-      `[N, DIRECTIONS, 2]` metres, pixel centres: of the whole mask, and of what is as high as the fingertips of a push.
-      0 where there is nothing.
+      Metres, to pixel centres, in each of the directions: of the whole mask, and of its part that is as high as the
+      fingertips of a push. 0 where a mask is empty.
     """
     normal = geometry.rotate2d(directions(), angle)
     middle = (np.array(label.shape[::-1]) - 1) / 2
@@ -156,25 +170,25 @@ def outlines(label: jax.Array, height: jax.Array, angle: jax.Array, centers: jax
     corner = jnp.clip(corner, 0, np.array(label.shape[::-1]) - OUTLINE_WINDOW)
     level = jnp.where(height > GRIPPER.push_tip, 2, 1)
 
-    def reach(slot: jax.Array, at: jax.Array, center: jax.Array) -> jax.Array:
+    def reach(slot: jax.Array, at: jax.Array, center: Array) -> jax.Array:
         cut = lambda image: jax.lax.dynamic_slice(image, (at[1], at[0]), (OUTLINE_WINDOW, OUTLINE_WINDOW))  # noqa: E731
         tall = jnp.where(cut(label) == slot, cut(level), 0)
         x, y = ((jnp.arange(OUTLINE_WINDOW) + at[k] - middle[k]) * WORKSPACE.pixel - center[k] for k in range(2))
         found = []
         for mask in (tall >= 1, tall >= 2):
-            high, low = jnp.where(mask, x, -_FAR).max(-1), jnp.where(mask, x, _FAR).min(-1)  # of each row
+            high, low = jnp.where(mask, x, -_FAR_AWAY).max(-1), jnp.where(mask, x, _FAR_AWAY).min(-1)  # of each row
             across = jnp.maximum(high[:, None] * normal[:, 0], low[:, None] * normal[:, 0])
-            farthest = jnp.where((high > -_FAR)[:, None], across + y[:, None] * normal[:, 1], -_FAR).max(0)
-            found.append(jnp.where(farthest > -_FAR / 2, farthest, 0.0))
+            farthest = jnp.where((high > -_FAR_AWAY)[:, None], across + y[:, None] * normal[:, 1], -_FAR_AWAY).max(0)
+            found.append(jnp.where(farthest > -_FAR_AWAY / 2, farthest, 0.0))
         return jnp.stack(found, -1)
 
     return jax.vmap(reach)(jnp.arange(centers.shape[0]), corner, centers)
 
 
 def over_batch(function: Callable[..., Any], *rows: Any) -> Any:
-    """`function` of each row of batched pytrees, jitted or not.
+    """Apply `function` to each row of batched pytrees, inside jit or not.
 
-    On a CPU one after the other, which keeps an image in the cache (2 times faster); all at once elsewhere.
+    Rows are taken one after the other on a CPU, which keeps an image in the cache (2 times faster), else all at once.
     """
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda row: function(*row), rows)
@@ -183,17 +197,17 @@ def over_batch(function: Callable[..., Any], *rows: Any) -> Any:
 
 @functools.partial(jax.jit, static_argnames=("slots", "view"))
 def push_inputs(
-    labels: jax.Array, heights: jax.Array, pushes: Push, *, slots: int, view: View
-) -> tuple[PushInput, jax.Array]:
-    """`push_input` over a batch: labels and heights `[B, 224, 224]`, pushes `[B]`."""
+    labels: Int[Array, "B H W"], heights: Float[Array, "B H W"], pushes: Push, *, slots: int, view: View
+) -> tuple[PushInput, Float[jax.Array, "B {slots} 2"]]:
+    """Apply `push_input` to a batch: labels, heights and as many pushes."""
     return over_batch(functools.partial(push_input, slots=slots, view=view), labels, heights, pushes)
 
 
 def mirror(inputs: PushInput) -> PushInput:
-    """The same push seen in a mirror that holds its axis (batched or not).
+    """Return the same push seen in a mirror that contains its axis (batched or not).
 
-    Row 112 of the maps is the axis and has no counterpart for row 0, so they are rolled by what the flip shifts them;
-    so are the directions of the outlines.
+    Row 112 of the maps is the axis and row 0 has no counterpart, so a flip shifts them by a row, which is rolled back;
+    the directions of the outlines likewise.
     """
     axis = inputs.push_map.ndim - 2
     flip = lambda m: jnp.roll(jnp.flip(m, axis), 1, axis)  # noqa: E731
@@ -206,19 +220,22 @@ def mirror(inputs: PushInput) -> PushInput:
     )
 
 
-def mirror_motion(motion: jax.Array) -> jax.Array:
-    """Motions `[..., 3]` (push frame) seen in the same mirror."""
+def mirror_motion(motion: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+    """Return motions (push frame) as seen in the same mirror."""
     return motion * jnp.array([1.0, -1.0, -1.0])
 
 
-def to_workspace(motion: jax.Array, angle: jax.Array) -> jax.Array:
-    """Network output `[..., N, 3]` (pixels, degrees, push frame) to metres and radians, workspace; `angle [...]`."""
+def to_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
+    """Turn network output (pixels, degrees, push frame) into metres and radians, workspace.
+
+    `angle` is the direction of the push, in radians.
+    """
     metric = motion / losses.PIXELS_DEGREES
     shift = geometry.rotate2d(metric[..., :2], angle[..., None])
     return jnp.concatenate([shift, metric[..., 2:]], -1)
 
 
-def from_workspace(motion: jax.Array, angle: jax.Array) -> jax.Array:
-    """Inverse of `to_workspace`."""
+def from_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
+    """Return the inverse of `to_workspace`."""
     shift = geometry.rotate2d(motion[..., :2], -angle[..., None])
     return jnp.concatenate([shift, motion[..., 2:]], -1) * losses.PIXELS_DEGREES

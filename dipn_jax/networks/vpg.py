@@ -7,14 +7,16 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jaxtyping import Float
 
 from dipn_jax.errors import UserError
 from dipn_jax.networks import resnet
-from dipn_jax.networks.grasp import SCALE, GraspConfig, GraspNet
+from dipn_jax.networks.grasp import INPUT_SCALE, GraspConfig, GraspNet
 from dipn_jax.sight import render
 
 PARTS = ("push", "grasp")
-GROWTH = 32
+"""Parts that a network may have, one for each primitive."""
+GROWTH_RATE = 32
 """Channels that a layer of a DenseNet adds."""
 
 
@@ -39,28 +41,28 @@ class VpgConfig:
 
 
 class _Layer(nnx.Module):
-    """BN, ReLU, 1x1 to four times GROWTH, BN, ReLU, 3x3 to GROWTH; appended to its input (Huang et al. 2017)."""
+    """Dense layer: BN, ReLU, 1x1 to 4 GROWTH_RATE, BN, ReLU, 3x3 to GROWTH_RATE, after its input (Huang 2017)."""
 
     def __init__(self, features_in: int, rngs: nnx.Rngs) -> None:
-        self.norms = nnx.List([nnx.BatchNorm(f, rngs=rngs) for f in (features_in, 4 * GROWTH)])
-        self.reduce = resnet.conv(features_in, 4 * GROWTH, 1, rngs, bias=False)
-        self.spatial = resnet.conv(4 * GROWTH, GROWTH, 3, rngs, bias=False)
+        self.norms = nnx.List([nnx.BatchNorm(f, rngs=rngs) for f in (features_in, 4 * GROWTH_RATE)])
+        self.reduce = resnet.conv(features_in, 4 * GROWTH_RATE, 1, rngs, bias=False)
+        self.spatial = resnet.conv(4 * GROWTH_RATE, GROWTH_RATE, 3, rngs, bias=False)
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W G"]:
         y = self.reduce(nnx.relu(self.norms[0](x)))
         return jnp.concatenate([x, self.spatial(nnx.relu(self.norms[1](y)))], -1)
 
 
 class DenseNet(nnx.Module):
-    """The features of a DenseNet: `[B, H, W, 3]` to `[B, H / 32, W / 32, features]`."""
+    """The features of a DenseNet, at stride 32."""
 
     def __init__(self, blocks: tuple[int, ...], rngs: nnx.Rngs) -> None:
-        self.stem = resnet.conv(3, 2 * GROWTH, 7, rngs, stride=2, bias=False)
-        self.stem_norm = nnx.BatchNorm(2 * GROWTH, rngs=rngs)
-        features, rows, norms, downs = 2 * GROWTH, [], [], []
+        self.stem = resnet.conv(3, 2 * GROWTH_RATE, 7, rngs, stride=2, bias=False)
+        self.stem_norm = nnx.BatchNorm(2 * GROWTH_RATE, rngs=rngs)
+        features, rows, norms, downs = 2 * GROWTH_RATE, [], [], []
         for i, count in enumerate(blocks):
-            rows.append(nnx.List([_Layer(features + GROWTH * j, rngs) for j in range(count)]))
-            features += GROWTH * count
+            rows.append(nnx.List([_Layer(features + GROWTH_RATE * j, rngs) for j in range(count)]))
+            features += GROWTH_RATE * count
             norms.append(nnx.BatchNorm(features, rngs=rngs))
             if i + 1 < len(blocks):
                 downs.append(resnet.conv(features, features // 2, 1, rngs, bias=False))
@@ -68,7 +70,7 @@ class DenseNet(nnx.Module):
         self.blocks, self.norms, self.downs = nnx.List(rows), nnx.List(norms), nnx.List(downs)
         self.features = features
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W 3"]) -> Float[jax.Array, "B h w {self.features}"]:
         x = resnet.max_pool(nnx.relu(self.stem_norm(self.stem(x))))
         for i, row in enumerate(self.blocks):
             for layer in row:
@@ -89,10 +91,10 @@ class _Trunks(nnx.Module):
         self.norms = nnx.List([nnx.BatchNorm(f, rngs=rngs) for f in (both, 64)])
         self.head = nnx.List([resnet.conv(both, 64, 1, rngs, bias=False), resnet.conv(64, 1, 1, rngs, bias=False)])
 
-    def __call__(self, images: jax.Array) -> jax.Array:
-        """`[B, H, W, 4]` to `[B, H, W]`; sides divisible by 16."""
+    def __call__(self, images: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
+        """Return a map of each image; sides divisible by 16."""
         b, h, w, _ = images.shape
-        x = (images - jnp.array([*render.TABLE_COLOR, 0.0])) / jnp.array(SCALE)
+        x = (images - jnp.array([*render.TABLE_COLOR, 0.0])) / jnp.array(INPUT_SCALE)
         x = jax.image.resize(x, (b, 2 * h, 2 * w, 4), "bilinear")
         y = jnp.concatenate([self.color(x[..., :3]), self.depth(jnp.repeat(x[..., 3:], 3, -1))], -1)
         for norm, conv in zip(self.norms, self.head, strict=True):
@@ -101,7 +103,7 @@ class _Trunks(nnx.Module):
 
 
 class VPG(nnx.Module):
-    """A map of pushes, a map of grasps, or both; as GN, seen in a view that is turned by the action's angle."""
+    """A map of pushes, a map of grasps, or both; as for GN, the view is turned by the action's angle."""
 
     def __init__(self, config: VpgConfig, *, rngs: nnx.Rngs) -> None:
         self.config = config

@@ -7,54 +7,54 @@ one runs is a configuration value.
 from __future__ import annotations
 
 import dataclasses
-import os
 from types import ModuleType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from dipn_jax.engine import Engine, EngineName, PhysicsConfig
 from dipn_jax.errors import UserError
+from dipn_jax.machine import cores
 from dipn_jax.structs import Array
 
 CONTROL_PERIOD = 0.01
-"""Seconds between set points; faults are looked for as often."""
+"""Seconds between set points, and between looks for faults."""
 MOST_SUBSTEPS = 100
-"""Time steps in a control period at most."""
+"""Time steps that a control period may have."""
 FENCE = 0.17
 """Metres from the workspace's centre along x or y beyond which a fence pushes centres of mass back."""
 FENCE_RATE = 30.0
 """rad/s of the fence's critically damped spring (per mass): 11 mm beyond it, the push is an object's weight."""
-
 ENOUGH_CORES = 8
 """Cores with which `native` is as fast as `mjx` on a large GPU (docs/benchmarks.md: an H200 does the work of 8.4)."""
 
 
-def fence_force(mass: Array, position: Array, velocity: Array, *, xp: ModuleType = jnp) -> Array:
-    """What a fence does to objects: it has no surface, so any number of them costs no contact.
+def fence_force(
+    mass: Float[Array, "*b N"],
+    position: Float[Array, "*b N 2"],
+    velocity: Float[Array, "*b N 2"],
+    *,
+    xp: ModuleType = jnp,
+) -> Float[Array, "*b N 2"]:
+    """Return the forces of a fence on objects; it has no surface, so any number of objects costs no contact.
 
     Args:
-      mass: `[..., N]` kg.
-      position: `[..., N, 2]` metres, workspace: centres of mass.
-      velocity: `[..., N, 2]` m/s.
+      mass: kg.
+      position: metres, workspace: centres of mass.
+      velocity: m/s.
       xp: numpy or jax.numpy.
 
     Returns:
-      Forces `[..., N, 2]` in newtons: zero within FENCE, a damped spring beyond.
+      Forces in newtons: zero within FENCE, a damped spring beyond.
     """
     beyond = position - xp.clip(position, -FENCE, FENCE)
     pull = -(FENCE_RATE**2) * beyond - 2 * FENCE_RATE * velocity
     return mass[..., None] * xp.where(beyond == 0, 0.0, pull)
 
 
-def cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def substeps(config: PhysicsConfig) -> int:
-    """Time steps in a control period.
+    """Return the number of time steps in a control period.
 
     Raises:
       UserError: that is not a whole number.
@@ -68,9 +68,10 @@ def substeps(config: PhysicsConfig) -> int:
 
 
 def resolve(name: EngineName) -> EngineName:
-    """`auto` is `native`, or `mjx` on an accelerator whose host has few cores (ENOUGH_CORES).
+    """Return the name of an engine: `auto` is `native`, or `mjx` on an accelerator whose host has few cores.
 
-    Never `warp`, though it is faster there: it is an extra, and its scenes share their room for contacts.
+    Few are less than ENOUGH_CORES. It is never `warp`, though that is faster on a GPU: it is an extra, and its scenes
+    share their room for contacts.
     """
     if name == "auto":
         return "native" if jax.default_backend() == "cpu" or cores() >= ENOUGH_CORES else "mjx"
@@ -78,10 +79,13 @@ def resolve(name: EngineName) -> EngineName:
 
 
 def make_engine(name: EngineName, *, timestep: float | None = None, sleep: float | None = None) -> Engine:
-    """Make the engine called `name`, with its own solver settings.
+    """Make the engine called `name`, with its own solver settings unless others are given.
 
         engine = dipn_jax.make_engine("native")
         rollout = dipn_jax.world.primitives.push(engine, scenes, poses, pushes)
+
+    Making `mjx` patches MuJoCo MJX in the whole process (`physics.patches`); models of other code that uses MJX in the
+    process are passed on to MJX's own functions. `native` and `warp` patch nothing.
 
     Args:
       name: engine, or `auto`.
@@ -91,19 +95,26 @@ def make_engine(name: EngineName, *, timestep: float | None = None, sleep: float
     Raises:
       UserError: no such engine, it cannot run here, or a time step that does not divide the control period.
     """
-    given = {"timestep": timestep, "sleep": sleep}
-    changes: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     name = resolve(name)
     if name == "native":
         from dipn_jax.physics import native
 
-        return native.NativeEngine(dataclasses.replace(native.DEFAULTS, **changes))
+        return native.NativeEngine(_configured(native.DEFAULTS, timestep, sleep))
     if name == "mjx":
         from dipn_jax.physics import mjx
 
-        return mjx.MjxEngine(dataclasses.replace(mjx.DEFAULTS, **changes))
+        return mjx.MjxEngine(_configured(mjx.DEFAULTS, timestep, sleep))
     if name == "warp":
         from dipn_jax.physics import warp
 
-        return warp.WarpEngine(dataclasses.replace(warp.DEFAULTS, **changes))
+        return warp.WarpEngine(_configured(warp.DEFAULTS, timestep, sleep))
     raise UserError(f"engine {name!r}: want auto, native, mjx or warp")
+
+
+def _configured(config: PhysicsConfig, timestep: float | None, sleep: float | None) -> PhysicsConfig:
+    """Return `config` with the time step and the sleep that are given."""
+    return dataclasses.replace(
+        config,
+        timestep=config.timestep if timestep is None else timestep,
+        sleep=config.sleep if sleep is None else sleep,
+    )

@@ -1,4 +1,4 @@
-"""Contact forces with elliptic friction cones that hold in float32, in place of MJX's solver.
+"""Contact forces with elliptic friction cones that stay right in float32, unlike those of MJX's solver.
 
 MJX's line search computes the squared length of a contact's tangential residual as `uu + a (2 uv + a vv)`. Where
 a Newton step ends sliding that is zero, in float32 often a little below it; the root is NaN, the cost of the whole
@@ -22,22 +22,23 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco.mjx._src import solver, support
+from mujoco.mjx._src import support
 from mujoco.mjx._src.types import ConeType, SolverType
 
 from dipn_jax.structs import Pytree
 
-DECREMENT = 1e-6
-"""Newton ends when the cost it can still gain is below this share of the cost (float32 resolves 1e-7)."""
-FLAT = 0.1
-"""The line search ends when the slope is below this share of the slope at its beginning ..."""
-NARROW = 1e-2
-"""... or when what is left of its bracket is below this share of the step: rounding hides so small a slope."""
-TRIES = np.float32(4.0) ** np.arange(-6, 2, dtype=np.float32)
-"""Multiples of a Newton step that are tried first: tried at once, many cost an accelerator no more than one."""
-STRETCH = 4.0 ** len(TRIES)
-"""Most that a step grows from one round of tries to the next while the minimum is further on."""
+NEWTON_TOLERANCE = 1e-6
+"""Share of the cost: Newton ends when it can still lower the cost by less (float32 resolves 1e-7)."""
+FLAT_SLOPE = 0.1
+"""Share of the slope at its beginning below which the line search ends."""
+NARROW_BRACKET = 1e-2
+"""Share of the step below which the line search ends too, when its bracket is that narrow: rounding hides the slope."""
+FIRST_STEPS = np.float32(4.0) ** np.arange(-6, 2, dtype=np.float32)
+"""Multiples of a Newton step that are tried first, all at once: many cost an accelerator no more than one."""
+STRETCH_LIMIT = 4.0 ** len(FIRST_STEPS)
+"""Factor by which a step grows at most from one round of tries to the next while the minimum is further on."""
 _TINY = 1e-12
+"""Least divisor: lengths and squares are raised to it before something is divided by them."""
 
 
 @flax.struct.dataclass
@@ -59,7 +60,7 @@ class _Problem(Pytree):
 
 @flax.struct.dataclass
 class _Reach(Pytree):
-    """Where residuals `u [C, K]` lie with respect to their cones."""
+    """Places of residuals `u [C, K]` with respect to their cones."""
 
     away: jax.Array  # [C, K] from the nearest point of the cone to u
     below: jax.Array  # [C] bool: the nearest point is the tip
@@ -83,7 +84,7 @@ def _reach(u: jax.Array, mu: jax.Array) -> _Reach:
 
 
 def _curvature(reach: _Reach, w: jax.Array) -> jax.Array:
-    """Second derivative `[C]` of half the squared distance along `w [C, K]`."""
+    """Return the second derivative `[C]` of half the squared distance along `w [C, K]`."""
     along = (reach.tangent * w).sum(-1, keepdims=True)
     across = (w - along * reach.tangent).at[:, 0].set(0.0)
     side = (reach.inward * w).sum(-1) ** 2 + reach.bend * (across**2).sum(-1)
@@ -91,7 +92,7 @@ def _curvature(reach: _Reach, w: jax.Array) -> jax.Array:
 
 
 def _blocks(reach: _Reach) -> jax.Array:
-    """Hessian `[C, K, K]` of half the squared distance: a sum of squares, so never indefinite by more than rounding."""
+    """Return the Hessian `[C, K, K]` of half the squared distance: a sum of squares, so never really indefinite."""
     eye = jnp.eye(reach.away.shape[1])
 
     def outer(v: jax.Array) -> jax.Array:
@@ -103,12 +104,12 @@ def _blocks(reach: _Reach) -> jax.Array:
 
 
 def _residuals(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Of rows `[R]` and of cones `[C, K]`."""
+    """Return the residuals of the rows `[R]` and of the cones `[C, K]`."""
     return p.rows @ a - p.goal, p.cones @ a - p.cone_goal
 
 
 def _pushing(p: _Problem, x: jax.Array) -> jax.Array:
-    """Weights `[R]` of rows with residuals `x`, zero for those that do not push."""
+    """Return weights `[R]` of rows with residuals `x`; zero for those that do not push."""
     return jnp.where(p.always | (x < 0), p.weight, 0.0)
 
 
@@ -120,7 +121,7 @@ def _cost(p: _Problem, a: jax.Array) -> jax.Array:
 
 
 def _newton(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cost `[]`, gradient and Newton step `[V]` at `a`."""
+    """Return cost `[]`, gradient `[V]` and Newton step `[V]` at `a`."""
     x, u = _residuals(p, a)
     push, reach = _pushing(p, x), _reach(u, p.mu)
     away = p.stiffness[:, None] * reach.away
@@ -138,7 +139,7 @@ def _newton(p: _Problem, a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _slopes(p: _Problem, a: jax.Array, step: jax.Array) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
-    """First and second derivative of the cost along `step`, as a function of the multiple taken."""
+    """Return a function of the multiple of `step` taken: first and second derivative of the cost along it."""
     x, u = _residuals(p, a)
     dx, du = p.rows @ step, p.cones @ step
     slope_0, slope_1 = (p.mass @ a - p.force) @ step, (p.mass @ step) @ step
@@ -155,13 +156,13 @@ def _slopes(p: _Problem, a: jax.Array, step: jax.Array) -> Callable[[jax.Array],
 def _line_search(
     p: _Problem, a: jax.Array, step: jax.Array, begin: jax.Array, limit: int, idle: jax.Array
 ) -> jax.Array:
-    """The multiple of `step` with the least cost: many are tried at once, then Newton and many more in a bracket.
+    """Return the multiple of `step` with the least cost: many are tried at once, then Newton and more in a bracket.
 
-    The slope is `begin` where `step` does. In a batch all scenes wait for the one that tries most often; one that is
-    `idle`, its result of no use, is not waited for.
+    `begin` is the slope at the beginning of the step. In a batch all scenes wait for the one that needs most rounds; a
+    scene that is `idle`, because its result is not used, takes none.
     """
     slopes = jax.vmap(_slopes(p, a, step))
-    parts = jnp.arange(1, len(TRIES)) / len(TRIES)
+    parts = jnp.arange(1, len(FIRST_STEPS)) / len(FIRST_STEPS)
 
     def going(state: tuple[jax.Array, ...]) -> jax.Array:
         return ~state[-1] & (state[-2] < limit)
@@ -173,24 +174,26 @@ def _line_search(
         high = jnp.minimum(high, jnp.where(first < 0, jnp.inf, tries).min())
         steep = jnp.where(jnp.isfinite(first), jnp.abs(first), jnp.inf)
         best = steep.argmin()
-        found = (steep[best] <= FLAT * jnp.abs(begin)) | (jnp.isfinite(high) & (high - low <= NARROW * high))
+        found = (steep[best] <= FLAT_SLOPE * jnp.abs(begin)) | (
+            jnp.isfinite(high) & (high - low <= NARROW_BRACKET * high)
+        )
         guess = tries[best] - first[best] / second[best]
-        end = jnp.where(jnp.isfinite(high), high, STRETCH * low)
-        start = jnp.where(low > 0, low, TRIES[0] * high)
+        end = jnp.where(jnp.isfinite(high), high, STRETCH_LIMIT * low)
+        start = jnp.where(low > 0, low, FIRST_STEPS[0] * high)
         inside = (guess > low) & (guess < end)
         more = start * (end / start) ** parts
         fresh = jnp.append(more, jnp.where(inside, guess, jnp.sqrt(start * end)))
         return low, high, fresh, tries[best], count + 1, found
 
     zero = jnp.zeros_like(begin)
-    tries = jnp.asarray(TRIES)
+    tries = jnp.asarray(FIRST_STEPS)
     state: tuple[jax.Array, ...] = (zero, zero + jnp.inf, tries, zero, jnp.zeros((), jnp.int32), idle)
     low, _, _, t, _, found = jax.lax.while_loop(going, body, state)
     return jnp.where(found, t, low)  # the cost falls all the way to `low`
 
 
 def _minimize(p: _Problem, start: jax.Array, iterations: int, line: int) -> jax.Array:
-    """The acceleration `[V]` with the least cost."""
+    """Return the acceleration `[V]` with the least cost."""
 
     def going(state: tuple[jax.Array, ...]) -> jax.Array:
         return ~state[-1] & (state[-2] < iterations)
@@ -200,14 +203,14 @@ def _minimize(p: _Problem, start: jax.Array, iterations: int, line: int) -> jax.
         cost, gradient, step = _newton(p, a)
         slope = gradient @ step
         a = a + jnp.where(slope < 0, _line_search(p, a, step, slope, line, done), 0.0) * step
-        return a, count + 1, ~(-slope / 2 > DECREMENT * cost)
+        return a, count + 1, ~(-slope / 2 > NEWTON_TOLERANCE * cost)
 
     state: tuple[jax.Array, ...] = (start, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
     return jax.lax.while_loop(going, body, state)[0]
 
 
 def _problem(m: Any, d: Any) -> tuple[_Problem, np.ndarray, jax.Array]:
-    """The problem, the constraint rows `[C, K]` of its cones (-1: none) and their scales `[C, K]`."""
+    """Return the problem, the constraint rows `[C, K]` of its cones (-1: none) and their scales `[C, K]`."""
     impl, contact = d._impl, d._impl.contact
     dims, first = np.asarray(contact.dim), np.asarray(contact.efc_address)
     k = np.arange(dims.max())
@@ -232,14 +235,14 @@ def _problem(m: Any, d: Any) -> tuple[_Problem, np.ndarray, jax.Array]:
 
 
 def solve(m: Any, d: Any) -> Any:
-    """Constraint forces and accelerations of one state.
+    """Compute the constraint forces and accelerations of one state.
 
     Args:
       m: MJX model (JAX implementation, Newton, elliptic cone, no friction loss).
       d: its data, up to `forward.fwd_acceleration`.
 
     Returns:
-      `d` with `qacc`, `qfrc_constraint` and `efc_force`. The force is what the acceleration needs, so that an
+      `d` with `qacc`, `qfrc_constraint` and `efc_force`. The force is the one that the acceleration needs, so that an
       implicit integrator, which starts from forces, does not multiply what is left of the gradient.
     """
     p, index, scale = _problem(m, d)
@@ -254,21 +257,7 @@ def solve(m: Any, d: Any) -> Any:
     return d.tree_replace({"qacc": a, "qfrc_constraint": p.mass @ a - p.force, "_impl.efc_force": force})
 
 
-def _ours(m: Any, d: Any) -> bool:
-    """Whether `solve` knows all that the model has."""
+def is_supported(m: Any, d: Any) -> bool:
+    """Return whether `solve` can solve this model: elliptic cones, Newton, no friction loss, contacts with friction."""
     elliptic = m.opt.cone == ConeType.ELLIPTIC and m.opt.solver == SolverType.NEWTON
     return elliptic and not d._impl.nf and len(d._impl.contact.dim) > 0 and min(d._impl.contact.dim) > 1
-
-
-def _choosing(upstream: Callable[..., Any]) -> Callable[..., Any]:
-    def solve_constraints(m: Any, d: Any) -> Any:
-        return solve(m, d) if _ours(m, d) else upstream(m, d)
-
-    solve_constraints.upstream = upstream  # type: ignore[attr-defined]
-    return solve_constraints
-
-
-def register() -> None:
-    """Put `solve` in the place of MJX's for the models it knows; a second call changes nothing."""
-    if not hasattr(solver.solve, "upstream"):
-        solver.solve = _choosing(solver.solve)

@@ -14,8 +14,10 @@ from dipn_jax.structs import Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world.model import GRIPPER_DOF
 
-_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
-_FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}FULL")) for name in ("CONTACT", "CNSTR")]
+_NOT_FINITE_WARNINGS = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
+"""Warnings of MuJoCo that something is not finite, or huge."""
+_FULL_WARNINGS = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}FULL")) for name in ("CONTACT", "CNSTR")]
+"""Warnings of MuJoCo that contacts or constraints were left out."""
 
 
 class Worlds(Protocol):
@@ -28,7 +30,7 @@ class Worlds(Protocol):
 
     @property
     def warning(self) -> np.ndarray:
-        """Of each kind of mjtWarning (last info, count) `[B, W, 2]`."""
+        """Warnings of each kind of mjtWarning: (last info, count) `[B, W, 2]`."""
         ...
 
     def advance(self) -> tuple[np.ndarray, np.ndarray]:
@@ -36,11 +38,11 @@ class Worlds(Protocol):
         ...
 
     def last_depths(self) -> np.ndarray:
-        """Deepest contact `[B]` in metres of the last step, but for those among objects asleep."""
+        """Return the deepest contact `[B]` in metres of the last step, without those among objects asleep."""
         ...
 
     def depths(self) -> np.ndarray:
-        """Deepest contact `[B]` in metres now."""
+        """Return the deepest contact `[B]` in metres now."""
         ...
 
 
@@ -55,8 +57,8 @@ def follow(
     settle: bool,
     fence: float,
 ) -> Rollout:
-    """Run `sims` along `trajectories`; arguments as `Engine.simulate`, but for `scenes` and `slots`, from `pack`."""
-    present = scenes.shape >= 0
+    """Run `sims` along `trajectories`; `scenes` and `slots` are from `pack`, the rest as in `Engine.simulate`."""
+    present = np.asarray(scenes.shape >= 0)
     mass = np.where(present, scenes.mass, 0.0)
     ticks = np.round(samples / physics.CONTROL_PERIOD).astype(int)
     last = int(ticks[-1])
@@ -72,14 +74,14 @@ def follow(
             if fence:
                 hold_in(sims, mass, up=times[tick] < fence)
             watch.raised(*sims.advance())
-            watch.tick(now[tick + 1], deep=times[tick] >= max(fence, faults.GRACE))
+            watch.tick(now[tick + 1], deep=times[tick] >= max(fence, faults.GRACE_TIME))
     fault = watch.codes(now[last], settle)
     rollout, hand = (np.stack(part, 1).astype(np.float32) for part in zip(*stored, strict=True))
     return Rollout(rollout, hand, fault)
 
 
 class Watch:
-    """Collects faults while a batch runs. What was not finite once stays so."""
+    """Collects faults while a batch runs. A scene that was not finite once counts as broken until the end."""
 
     def __init__(self, scenes: Scene, sims: Worlds) -> None:
         self.scenes, self.sims = scenes, sims
@@ -94,11 +96,11 @@ class Watch:
         self.broken[failed], self.full[full] = True, True
 
     def velocity(self) -> np.ndarray:
-        """Of the objects `[B, N, 6]`."""
+        """Return the velocities of the objects `[B, N, 6]`."""
         return np.asarray(self.sims.qvel)[:, GRIPPER_DOF:].reshape(*self.scenes.shape.shape, 6)
 
     def tick(self, target: np.ndarray, *, deep: bool) -> None:
-        """Note speeds, depths (if `deep`), and how far the hand is off its `target [B, 6]`."""
+        """Note speeds, depths (if `deep`) and how far the hand is off its `target [B, 6]`."""
         linear = self.velocity()[..., :3]
         np.maximum(self.fastest, np.einsum("bnk,bnk->bn", linear, linear), out=self.fastest)
         np.maximum(self.off, np.abs(np.asarray(self.sims.qpos)[:, :3] - target[:, :3]), out=self.off)
@@ -106,13 +108,13 @@ class Watch:
             np.fmax(self.deepest, self.sims.last_depths(), out=self.deepest)
 
     def codes(self, target: np.ndarray, settle: bool) -> np.ndarray:
-        """Fault codes `[B]` at the end of a rollout."""
+        """Return fault codes `[B]` at the end of a rollout."""
         warning = np.asarray(self.sims.warning)[..., 1]  # (last info, count)
         qpos = np.array(self.sims.qpos)
         present = self.scenes.shape >= 0
         finite = np.isfinite(self.fastest)
         stray = self.off.max(-1)
-        return faults.codes(
+        codes = faults.codes(
             self.scenes,
             qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7),
             self.velocity(),
@@ -120,17 +122,18 @@ class Watch:
             target[:, :3],
             top=np.sqrt(np.where(present & finite, self.fastest, 0.0)).max(-1),
             stray=np.where(np.isfinite(stray), stray, np.inf),
-            broken=self.broken | (present & ~finite).any(-1) | (warning[:, _BAD] > 0).any(-1),
-            full=self.full | (warning[:, _FULL] > 0).any(-1),
+            broken=self.broken | (present & ~finite).any(-1) | (warning[:, _NOT_FINITE_WARNINGS] > 0).any(-1),
+            full=self.full | (warning[:, _FULL_WARNINGS] > 0).any(-1),
             depth=np.where(self.broken, 0.0, self.sims.depths()),
             deepest=self.deepest,
             settle=settle,
             xp=np,
         )
+        return np.asarray(codes)
 
 
 def pack(scenes: Scene, poses: np.ndarray) -> tuple[Scene, np.ndarray]:
-    """Present objects first, and only as many slots as the fullest scene needs; `slots [B, n]` says which."""
+    """Return scenes with present objects first and only the slots that the fullest scene needs, and which `[B, n]`."""
     present = scenes.shape >= 0
     n = max(1, int(present.sum(-1).max()))
     slots = np.argsort(~present, axis=-1, kind="stable")[:, :n]
@@ -142,7 +145,7 @@ def pack(scenes: Scene, poses: np.ndarray) -> tuple[Scene, np.ndarray]:
 
 
 def unpack(qpos: np.ndarray, poses: np.ndarray, slots: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Object poses `[B, N, 7]` in the caller's slots; empty slots keep their pose (as bodies they just fall)."""
+    """Return object poses `[B, N, 7]` in the caller's slots; empty slots keep their pose (as bodies they just fall)."""
     out = np.array(poses)
     fresh = np.array(qpos).reshape(*slots.shape, 7).astype(out.dtype)
     old = np.take_along_axis(out, slots[..., None], 1)
@@ -162,7 +165,7 @@ def hold_in(sims: Worlds, mass: np.ndarray, *, up: bool) -> None:
 
 
 def controls(trajectories: Trajectory, time: np.ndarray) -> np.ndarray:
-    """Actuator set points `[T, B, 6]` at `time [T]`: linear between key frames, gap split over both fingers."""
+    """Return actuator set points `[T, B, 6]` at `time [T]`: linear between key frames, half the gap a finger."""
     times, targets = trajectories.time, trajectories.target
     when = time[:, None]
     index = np.clip((times <= when[..., None]).sum(-1) - 1, 0, times.shape[1] - 2)
@@ -174,5 +177,5 @@ def controls(trajectories: Trajectory, time: np.ndarray) -> np.ndarray:
 
 
 def gripper(qpos: np.ndarray) -> np.ndarray:
-    """The gripper `[B, 5]` as in `Rollout.gripper`, of generalized positions `[B, 6 + 7 N]`."""
+    """Return the gripper `[B, 5]` as in `Rollout.gripper`, from generalized positions `[B, 6 + 7 N]`."""
     return np.concatenate([qpos[:, :4], qpos[:, 4:5] + qpos[:, 5:6]], -1)

@@ -1,4 +1,4 @@
-"""Traced programs on disk: XLA's own cache saves compiling, and what is left of a first call is tracing, in Python."""
+"""Traced programs on disk. XLA's own cache saves compiling; most of the rest of a first call is tracing, in Python."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from jax import export
 from dipn_jax import files
 from dipn_jax.structs import Array
 
-_BEGUN_WITH = files.code_digest()
-"""Read while the sources are imported: who edits them later does not change what this process traces."""
+_CODE_AT_IMPORT = files.code_digest()
+"""Digest of the sources, taken while they are imported: editing them later does not change what this process traces."""
 
 
 def program(
     function: Callable[..., tuple[Array, ...]], arguments: Sequence[np.ndarray], *, what: str, donate: Sequence[int]
 ) -> Callable[..., tuple[Array, ...]]:
-    """`jax.jit(function)`, traced by an earlier process if one was.
+    """Return `jax.jit(function)`, with the trace that an earlier process made if there is one.
 
     Args:
-      function: of arrays, for one device, of the kind that JAX takes unasked.
-      arguments: what it will be called with; only shapes and types matter.
-      what: everything else that its trace depends on, such as a default precision of the moment.
+      function: of arrays, for one device, of the default kind.
+      arguments: arrays as it will be called with; only shapes and types matter.
+      what: everything else that its trace depends on, such as the present default precision.
       donate: arguments whose memory the result takes over.
 
     Returns:
-      A function of as many arrays. Traces lie in `traced` in the folder of JAX's compilation cache; without such a
-      folder, or where it cannot be written, nothing is kept. A file that cannot be read is written anew.
+      A function of the same arguments. Traces are kept in `traced` in the folder of JAX's compilation cache; without
+      such a folder, or where it cannot be written, nothing is kept. A file that cannot be read is written anew.
     """
     shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.asarray(leaf).dtype) for leaf in arguments]
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not cache:
         return jax.jit(function, donate_argnums=tuple(donate))
-    about = [_BEGUN_WITH, jax.default_backend(), str(jax.config.read("jax_enable_x64")), what, str(shapes)]
+    about = [_CODE_AT_IMPORT, jax.default_backend(), str(jax.config.read("jax_enable_x64")), what, str(shapes)]
     key = hashlib.sha256("\n".join(about).encode()).hexdigest()
     path = pathlib.Path(cache) / "traced" / key
     try:
@@ -45,7 +45,7 @@ def program(
         try:
             traced = export.export(jax.jit(function))(*shapes)
             files.write_atomically(path, bytes(traced.serialize()))
-        except (OSError, ValueError):  # a folder that is not for us to write, a device whose programs cannot be kept
+        except (OSError, ValueError):  # a folder that cannot be written, a device whose programs cannot be kept
             return jax.jit(function, donate_argnums=tuple(donate))
     else:
         # JAX finds LAPACK when it lowers something that calls it; a program lowered elsewhere would crash without

@@ -9,6 +9,7 @@ import threading
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 from mujoco import batch as mujoco_batch
 
 from dipn_jax import physics, structs
@@ -20,15 +21,16 @@ from dipn_jax.world import model
 from dipn_jax.world.model import GRIPPER_DOF
 from dipn_jax.world.scenes import parked
 
-DEFAULTS = PhysicsConfig(sleep=1e-3)  # halves the time; 5 cm of a push: 0.01 mm (p50), 0.4 mm (p90) from never
-CAMERA = 1.0
+DEFAULTS = PhysicsConfig(sleep=1e-3)
+"""Sleeping halves the time and moves objects, after 5 cm of a push, by 0.01 mm (p50) and 0.4 mm (p90)."""
+CAMERA_HEIGHT = 1.0
 """Metres above the table that rays are cast from."""
 MODELS_KEPT = 256
-"""Compiled models an engine remembers, about 0.1 MB each."""
+"""Compiled models that an engine keeps, about 0.1 MB each."""
 
 
 class NativeEngine:
-    """See `Engine`. Results do not depend on the number of threads."""
+    """An `Engine` on MuJoCo C. Results do not depend on the number of threads."""
 
     name = "native"
     batch = 64
@@ -42,14 +44,14 @@ class NativeEngine:
     def simulate(
         self,
         scenes: Scene,
-        poses: Array,
+        poses: Float[Array, "B N 7"],
         trajectories: Trajectory,
-        samples: Array,
+        samples: Float[Array, " S"],
         *,
         settle: bool = False,
         fence: float = 0.0,
     ) -> Rollout:
-        """See `Engine.simulate`; arrays in, numpy arrays out."""
+        """See `Engine.simulate`; takes arrays of any kind, returns NumPy arrays."""
         scenes, trajectories = jax.tree.map(np.asarray, (scenes, trajectories))
         poses = np.asarray(poses)
         packed, slots = hosted.pack(scenes, poses)
@@ -68,7 +70,7 @@ class NativeEngine:
         self.stopped.set()
 
     def _compile(self, scenes: Scene) -> list[mujoco.MjModel]:
-        """One model a scene; that of a scene met a short while ago (it settled, now it is pushed) is at hand."""
+        """Return a model of each scene. Recent ones are kept, because a scene that has settled is then pushed."""
 
         def compiled(i: int) -> mujoco.MjModel:
             scene = jax.tree.map(lambda leaf: leaf[i], scenes)
@@ -122,7 +124,7 @@ class _Worlds:
 
 
 def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray) -> np.ndarray:
-    """Deepest contact `[B]` in metres of `models`, all of one layout, at `qpos [B, Q]`; 0 where that is not finite.
+    """Return the deepest contact `[B]` in metres of `models`, all of one layout, at `qpos [B, Q]`; 0 if not finite.
 
     Sleeping objects have no contacts among themselves, so this looks at the state anew.
     """
@@ -131,22 +133,24 @@ def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray) -> np.ndarray
         data.qpos[:] = qpos[i]
         try:
             mujoco.mj_fwdPosition(models[i], data)
-        except mujoco.FatalError:  # no room for its contacts: a fault that stepping has noted
+        except mujoco.FatalError:  # no room for its contacts: stepping has already noted this fault
             data = mujoco.MjData(models[0])
         deepest[i] = -min(data.contact.dist.min(initial=0.0), 0.0)
     return deepest
 
 
-def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> tuple[np.ndarray, np.ndarray]:
-    """What MuJoCo's ray caster sees from straight above: the reference of `dipn_jax.sight.render`.
+def raycast(
+    scenes: Scene, poses: Float[Array, "B N 7"], *, pixels: int = WORKSPACE.pixels
+) -> tuple[Float[np.ndarray, "B {pixels} {pixels}"], Int[np.ndarray, "B {pixels} {pixels}"]]:
+    """Return what MuJoCo's ray caster sees from straight above: the reference of `dipn_jax.sight.render`.
 
     Args:
-      scenes: `[B, N, ...]`.
-      poses: `[B, N, 7]`.
+      scenes: B scenes.
+      poses: metres and quaternions wxyz, workspace.
       pixels: side of the square view, 2 mm a pixel.
 
     Returns:
-      Heights `[B, pixels, pixels]` in metres and labels (object slots, ABSENT on the table) of the same shape.
+      Heights in metres and labels (object slots, ABSENT on the table).
     """
     scenes, poses = jax.tree.map(np.asarray, scenes), np.asarray(poses)
     models = [
@@ -155,13 +159,13 @@ def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> t
     ]
     sims = mujoco_batch.Batch(models[0], nsim=len(models))
     sims.set_models(models)
-    sims.qpos[:, 2] = 2 * CAMERA  # the gripper is above the camera
+    sims.qpos[:, 2] = 2 * CAMERA_HEIGHT  # the gripper is above the camera
     sims.qpos[:, GRIPPER_DOF:] = poses.reshape(len(poses), -1)
     at = (np.arange(pixels) - (pixels - 1) / 2) * WORKSPACE.pixel
     x, y = np.meshgrid(at, at)
-    start = np.stack([x.ravel(), y.ravel(), np.full(x.size, CAMERA)], -1)
+    start = np.stack([x.ravel(), y.ravel(), np.full(x.size, CAMERA_HEIGHT)], -1)
     distance, geom = sims.ray(start, np.array([0.0, 0.0, -1.0]))
     body = models[0].geom_bodyid[geom]
     label = np.where(body >= models[0].body("o0").id, body - models[0].body("o0").id, ABSENT)
-    height = np.where(label == ABSENT, 0.0, CAMERA - distance)
+    height = np.where(label == ABSENT, 0.0, CAMERA_HEIGHT - distance)
     return height.reshape(-1, pixels, pixels), label.reshape(-1, pixels, pixels)

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig, Stopped
@@ -27,14 +28,18 @@ from dipn_jax.world.model import GRIPPER_DOF
 from dipn_jax.world.scenes import parked
 
 DEFAULTS = PhysicsConfig()
-CONTACTS, PAIRS, ROWS = 24, 12, 72
-"""Room an object: contacts, convex pairs, rows. Measured with 7 objects: at most 59 contacts, 186 rows a scene."""
-DENSE_NV = 60
+CONTACTS_PER_OBJECT = 24
+"""Contacts that there is room for, for every object and the gripper; measured: at most 59 a scene of 7 objects."""
+PAIRS_PER_OBJECT = 12
+"""Pairs of convex geoms that there is room for, likewise."""
+ROWS_PER_OBJECT = 72
+"""Rows of constraints that there is room for, likewise; measured: at most 186 a scene of 7 objects."""
+MOST_DENSE_DOF = 60
 """Degrees of freedom up to which MuJoCo Warp takes a dense Jacobian."""
 
 
 def _load() -> tuple[Any, Any]:
-    """Modules `warp` and `mujoco_warp`.
+    """Return the modules `warp` and `mujoco_warp`.
 
     Raises:
       UserError: they are not installed, do not fit each other, or find no place for compiled kernels.
@@ -53,12 +58,12 @@ def _load() -> tuple[Any, Any]:
 
 
 class WarpEngine:
-    """See `Engine`."""
+    """An `Engine` on MuJoCo Warp."""
 
     name = "warp"
 
     def __init__(self, config: PhysicsConfig = DEFAULTS, *, chunk: int = 512) -> None:
-        """An engine that compiles kernels when first used; Warp caches them on disk.
+        """Make an engine; kernels are compiled when it is first used, and Warp caches them on disk.
 
         Args:
           config: solver settings; the control period must be a whole number of time steps.
@@ -76,14 +81,14 @@ class WarpEngine:
     def simulate(
         self,
         scenes: Scene,
-        poses: Array,
+        poses: Float[Array, "B N 7"],
         trajectories: Trajectory,
-        samples: Array,
+        samples: Float[Array, " S"],
         *,
         settle: bool = False,
         fence: float = 0.0,
     ) -> Rollout:
-        """See `Engine.simulate`; numpy arrays out."""
+        """See `Engine.simulate`; returns NumPy arrays."""
         args = jax.tree.map(np.asarray, (scenes, poses, trajectories))
         done = []
         for start in range(0, len(args[1]), self.chunk):
@@ -114,7 +119,7 @@ class _Worlds:
     """
 
     def __init__(self, scenes: Scene, qpos: np.ndarray, engine: WarpEngine) -> None:
-        """Worlds at rest at `qpos [B, 6 + 7 N]`.
+        """Make worlds at rest at `qpos [B, 6 + 7 N]`.
 
         Raises:
           UserError: MuJoCo Warp lacks something that the MJCF or the configuration asks for.
@@ -132,7 +137,7 @@ class _Worlds:
             here = getattr(self.model, name)
             here.assign(rows.reshape(here.numpy().shape))
         self.model.opt.warn_overflow = 0  # kept in `data.overflow` all the same
-        room = [per_object * (slots + 1) for per_object in (CONTACTS, PAIRS, ROWS)]
+        room = [per_object * (slots + 1) for per_object in (CONTACTS_PER_OBJECT, PAIRS_PER_OBJECT, ROWS_PER_OBJECT)]
         self.data = self.mjw.make_data(spec, batch, nconmax=room[0], nccdmax=room[1], njmax=room[2])
         self.qpos, self.qvel = qpos, np.zeros((batch, spec.nv))
         self.ctrl, self.qfrc_applied = np.zeros((batch, spec.nu)), np.zeros((batch, spec.nv))
@@ -140,7 +145,7 @@ class _Worlds:
         self.data.qpos.assign(qpos.astype(np.float32))
 
     def _capture(self, substeps: int) -> Any:
-        """The steps of a control period as a graph to replay; None on a GPU that cannot record one."""
+        """Record the steps of a control period as a graph to replay; None on a GPU that cannot record one."""
         device = self.warp.get_device()
         if device.is_cuda:
             self.model.opt.graph_conditional = self.warp.is_conditional_graph_supported()
@@ -169,7 +174,7 @@ class _Worlds:
         return np.zeros(0, int), np.zeros(0, int)
 
     def depths(self) -> np.ndarray:
-        """See `hosted.Worlds`; as of the last step, too."""
+        """See `hosted.Worlds`; these are the depths of the last step, too."""
         return self.last_depths()
 
     def last_depths(self) -> np.ndarray:
@@ -182,7 +187,7 @@ class _Worlds:
 
     @property
     def warning(self) -> np.ndarray:
-        """As in MuJoCo C `[B, W, 2]` (last info, count). Contacts share their room, so a lack of it marks the batch."""
+        """Warnings as in MuJoCo C `[B, W, 2]` (last info, count); lack of room for contacts marks the whole batch."""
         kind, seen = self.mjw.OverflowType, self.data.overflow.numpy()
         contacts, rows = kind.BROADPHASE | kind.NARROWPHASE | kind.CCD, kind.NEFC | kind.NJMAX_NNZ
         out = np.zeros((len(seen), int(mujoco.mjtWarning.mjNWARNING), 2), int)
@@ -192,11 +197,11 @@ class _Worlds:
 
 
 def _compile(scenes: Scene, config: PhysicsConfig) -> tuple[mujoco.MjModel, np.ndarray]:
-    """The model of all `scenes [B, N]`, and the mesh of each part `[B, N, P]`, -1 where there is none."""
+    """Return the model of all `scenes [B, N]`, and the mesh of each part `[B, N, P]`; -1 where there is none."""
     text = model.mjcf(jax.tree.map(lambda leaf: leaf[0], scenes), config=config, generic=True)
     spec = mujoco.MjSpec.from_string(text)
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp has no reset to disable
-    if GRIPPER_DOF + 6 * scenes.shape.shape[1] > DENSE_NV:
+    if GRIPPER_DOF + 6 * scenes.shape.shape[1] > MOST_DENSE_DOF:
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     names, made = np.full((*scenes.shape.shape, shapes.PARTS), "", object), set()
     for b, slot in np.argwhere(scenes.shape >= 0):
@@ -214,7 +219,7 @@ def _compile(scenes: Scene, config: PhysicsConfig) -> tuple[mujoco.MjModel, np.n
 
 
 def _fields(spec: mujoco.MjModel, scenes: Scene, mesh: np.ndarray) -> dict[str, np.ndarray]:
-    """Model fields with a row a scene, for `scenes [B, N]` and their parts' `mesh [B, N, P]`.
+    """Return the fields of the model that have a row a scene, for `scenes [B, N]` and their parts' `mesh [B, N, P]`.
 
     Rows are filled up to a power of two, at least two: kernels are compiled for their number, and only with more
     than one is a geom without a mesh left out.
@@ -247,7 +252,7 @@ def _fields(spec: mujoco.MjModel, scenes: Scene, mesh: np.ndarray) -> dict[str, 
 
 
 def _outlines(spec: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """For each mesh, what a geom made of it has: where its frame is in the object's and what bounds it."""
+    """Return the fields of a geom that follow from its mesh, for each mesh: frame in the object's, and bounds."""
     ends = spec.mesh_vertadr + spec.mesh_vertnum
     corners = [spec.mesh_vert[start:end] for start, end in zip(spec.mesh_vertadr, ends, strict=True)]
     low, high = (np.stack([reach(c, axis=0) for c in corners]) for reach in (np.min, np.max))

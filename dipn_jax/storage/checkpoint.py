@@ -1,8 +1,8 @@
-"""The only owner of checkpoints: Orbax arrays, the config that rebuilds the network, and checksums.
+"""Checkpoints: Orbax arrays, the config that rebuilds the network, and checksums. No other module reads or writes them.
 
-`RUN/checkpoints/STEP/` holds one Orbax folder a part (`model`, `train`) and `meta.json`. Orbax restores
-flipped bits silently and takes an empty step folder for the latest, so every file's SHA-256 is kept and
-reading walks back to the newest step that is whole.
+`RUN/checkpoints/STEP/` holds an Orbax folder for each part (`model`, `train`) and `meta.json`. Orbax restores
+flipped bits silently and takes an empty step folder for the latest, so every file's SHA-256 is kept, and
+reading goes back to the newest step that is whole.
 """
 
 from __future__ import annotations
@@ -26,26 +26,29 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
 
 FORMAT_VERSION = 1
+"""Version of the format; steps of another version are ignored."""
 NETWORKS: dict[str, tuple[type, type]] = {
     "dipn": (dipn.DipnConfig, dipn.DIPN),
     "grasp": (grasp.GraspConfig, grasp.GraspNet),
     "vpg": (vpg.VpgConfig, vpg.VPG),
 }
+"""Config and class of each network by its name."""
 
 
 def build(name: str, config: Any, *, seed: int = 0) -> nnx.Module:
-    """A freshly initialized network of the given name and config."""
+    """Return a freshly initialized network of the given name and config."""
     return NETWORKS[name][1](config, rngs=nnx.Rngs(seed))
 
 
 def _steps(run: pathlib.Path) -> list[pathlib.Path]:
+    """Return the step folders of a run, newest first."""
     folder = run / "checkpoints"
     found = [p for p in folder.iterdir() if p.name.isdigit()] if folder.is_dir() else []
     return sorted(found, key=lambda p: int(p.name), reverse=True)
 
 
 def _flat(tree: Any) -> dict[str, Any]:
-    """Leaves of a pytree by their path."""
+    """Return the leaves of a pytree by their path."""
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
 
 
@@ -60,8 +63,8 @@ def save(
       parts: pytrees of arrays, one Orbax folder each; `model` is what `load_network` reads.
       network: a key of NETWORKS.
       config: the network's config dataclass.
-      extra: JSON-able: seed, data fingerprint, position in the data, training config.
-      keep: steps kept.
+      extra: seed, data fingerprint, training config; it has to fit into JSON.
+      keep: number of steps that are kept.
     """
     final = run.resolve() / "checkpoints" / f"{step:08d}"
     temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
@@ -71,7 +74,7 @@ def save(
     for name, tree in parts.items():
         checkpointer.save(temporary / name, _flat(tree))
     checkpointer.wait_until_finished()
-    for marker in temporary.rglob("commit_success.txt"):  # Orbax writes there where the folder stood
+    for marker in temporary.rglob("commit_success.txt"):  # Orbax writes the present folder into it
         marker.write_text("Checkpoint commit was successful\n")
     stored = sorted(p for p in temporary.rglob("*") if p.is_file())
     meta = {
@@ -92,7 +95,7 @@ def save(
 
 
 def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
-    """Copy the weights of a run's newest whole step to `out`, without what only training needs.
+    """Copy the weights of the newest whole step of a run to `out`, without what only training needs.
 
     Raises:
       UserError: as `load_network`.
@@ -106,7 +109,7 @@ def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
 
 
 def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
-    """The meta data of a step folder, or None if anything in it is missing or changed."""
+    """Return the metadata of a step folder, or None if anything in it is missing or changed."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
         good = all(files.file_sha256(folder / name) == digest for name, digest in meta["sha256"].items())
@@ -117,7 +120,7 @@ def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
 
 
 def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
-    """The newest whole step of a run and its meta data; None if there is none."""
+    """Return the newest whole step of a run and its metadata; None if there is none."""
     for folder in _steps(run):
         meta = _whole(folder)
         if meta is not None:
@@ -126,7 +129,7 @@ def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
 
 
 def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
-    """One part of a step, in the structure of `target`, on this process's default device.
+    """Restore one part of a step, in the structure of `target`, on this process's default device.
 
     Orbax would put arrays back on the devices that saved them, which another machine does not have; so they are read
     as NumPy arrays.
@@ -149,22 +152,23 @@ def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
 
 
 def _is_key(leaf: Any) -> bool:
-    """Whether a leaf is a random key (dropout's), which is stored as its numbers."""
+    """Return whether a leaf is a random key (dropout's), which is stored as its numbers."""
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _stored_shape(leaf: Any) -> tuple[int, ...]:
+    """Return the shape that a leaf is stored in."""
     return np.shape(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
 
 
 def _on_device(stored: np.ndarray, *, like: Any) -> jax.Array:
-    """A copy of `stored` on the default device (training donates its buffers); a random key where `like` is one."""
+    """Return a copy of `stored` on the default device (training donates its buffers); a random key if `like` is one."""
     array = jnp.array(stored)
     return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if _is_key(like) else array
 
 
 def _numpy_arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
-    """The arrays of one Orbax folder by their path in the tree, whatever devices saved them."""
+    """Return the arrays of one Orbax folder by their path in the tree, whatever devices saved them."""
     checkpointer = ocp.PyTreeCheckpointer()
     stored = checkpointer.metadata(part).item_metadata.tree
     as_numpy = {key: ocp.RestoreArgs(restore_type=np.ndarray) for key in stored}
@@ -173,7 +177,7 @@ def _numpy_arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def digest(model: nnx.Module) -> str:
-    """SHA-256 of a network's parameters."""
+    """Return the SHA-256 of a network's parameters."""
     found = hashlib.sha256()
     for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)):
         found.update(np.asarray(leaf).tobytes())
@@ -181,13 +185,13 @@ def digest(model: nnx.Module) -> str:
 
 
 def config_from_json(name: str, values: dict[str, Any]) -> Any:
-    """A network's config dataclass from `meta.json`."""
+    """Return a network's config dataclass, from its values in `meta.json`."""
     fields = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     return NETWORKS[name][0](**fields)
 
 
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
-    """The folder of a run; `builtin` stands for the network that comes with the package, if one does."""
+    """Return the folder of a run; `builtin` stands for the network that comes with the package, if one does."""
     if str(run) != "builtin":
         return run
     folder = pathlib.Path(__file__).parents[1] / "data" / network
@@ -204,7 +208,7 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
 
     Args:
       run: a run's folder, or `builtin`.
-      network: a key of NETWORKS, what the caller can use.
+      network: a key of NETWORKS, which the run has to hold.
 
     Raises:
       UserError: no run there, no whole step in it, or it holds another network.

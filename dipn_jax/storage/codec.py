@@ -1,14 +1,18 @@
-"""Episodes' numbers as whole multiples of a quantum, so that a file holds what a measurement could tell and no noise.
+"""Episodes as columns of whole multiples of a quantum, so that a file holds what could be measured and no noise.
 
-Poses of a push are kept as changes from centimetre to centimetre, and poses after an action as changes from those
+Poses of a push are stored as changes from centimetre to centimetre, and poses after an action as changes from those
 before: most objects do not move, and zeros take no room. A decoded value is within half a quantum.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
+
+from dipn_jax import structs
 
 QUANTA = {
     "poses": 1e-6,  # metres, and components of quaternions
@@ -24,17 +28,36 @@ QUANTA = {
     "grasp.angle": 1e-6,
     "grasp.height": 1e-6,
 }
+"""Quanta of the columns that are quantized."""
 Columns = dict[str, np.ndarray]
+"""Columns of a data set by their name."""
+
+
+def columns(episodes: Any) -> Columns:
+    """Return the leaves of a struct of episodes as columns `[B, ...]`, by dotted name."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(episodes)
+    return {jax.tree_util.keystr(path).lstrip("."): np.asarray(leaf) for path, leaf in leaves}
+
+
+def assemble(struct: type, columns: Columns, *, prefix: str = "") -> Any:
+    """Return the struct of episodes whose leaves are `columns`; names of structs inside it begin with `prefix`."""
+    nested = {"scene": structs.Scene, "push": structs.Push, "grasp": structs.Grasp}
+    values = {}
+    for field in dataclasses.fields(struct):
+        name = prefix + field.name
+        inner = nested.get(field.name)
+        values[field.name] = assemble(inner, columns, prefix=f"{name}.") if inner else columns[name]
+    return struct(**values)
 
 
 def encode(columns: Columns) -> tuple[Columns, dict[str, dict[str, Any]]]:
-    """Columns `[B, ...]` as they are stored, and what decoding them takes.
+    """Return columns `[B, ...]` as they are stored, and how to decode them.
 
     Args:
-      columns: as in `structs`, by dotted name.
+      columns: as from `columns`.
 
     Returns:
-      Columns of the same names and shapes, quantized ones as int32; and for each of these the keys `quantum` and
+      Columns of the same names and shapes, quantized ones as int32; and for each of those the keys `quantum` and
       `code`: `value`, `delta` (differences along the second axis) or `from poses` (from the last of `poses`).
 
     Raises:
@@ -62,11 +85,12 @@ def encode(columns: Columns) -> tuple[Columns, dict[str, dict[str, Any]]]:
 
 
 def _last(poses: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the last poses before the action, in the shape of those after it."""
     return poses[:, -1] if poses.ndim > after.ndim else poses
 
 
 def decode(stored: Columns, specs: dict[str, dict[str, Any]]) -> Columns:
-    """Inverse of `encode`; quantized columns come back as float32."""
+    """Return the inverse of `encode`; quantized columns become float32."""
     columns = {name: value.astype(np.int64) if name in specs else value for name, value in stored.items()}
     if specs.get("poses", {}).get("code") == "delta":
         columns["poses"] = np.cumsum(columns["poses"], axis=1)

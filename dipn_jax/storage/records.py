@@ -1,15 +1,7 @@
-"""The only owner of the data set format.
-
-A data set is a folder of Parquet shards and a `manifest.json`. Every column is a leaf of an episode
-struct, flattened, and quantized as `codec` says; its shape, dtype and quantum, the schema version, the kind,
-the config and the versions of the packages that made it stand in the shard's own metadata. A shard is
-written under a temporary name, synced and renamed, so a file with a shard's name is whole or was damaged
-later, which its SHA-256 shows.
-"""
+"""Data sets: folders of shards (`shards`) with a `manifest.json` that lists them and their SHA-256."""
 
 from __future__ import annotations
 
-import dataclasses
 import fcntl
 import hashlib
 import json
@@ -18,147 +10,20 @@ from typing import Any
 
 import jax
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from dipn_jax import files, structs
+from dipn_jax import files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import codec
+from dipn_jax.storage import shards
 
-
-class DamagedShard(UserError):
-    """A file that was a shard, or has a shard's name, and cannot be read as one."""
-
-
-SCHEMA_VERSION = 2
-COMPRESSION = 9
-"""Level of zstd: bytes of one place of all numbers stand together, which takes it a few milliseconds a shard."""
-KINDS: dict[str, type] = {
-    "push": structs.PushEpisode,
-    "grasp": structs.GraspEpisode,
-    "images": structs.SettledScene,
-}
 MANIFEST = "manifest.json"
-_META = b"dipn_jax"
-
-
-def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
-    """Where shard `index` of a data set lies."""
-    return folder / f"shard-{index:05d}.parquet"
-
-
-def _columns(episodes: Any) -> dict[str, np.ndarray]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(episodes)
-    return {jax.tree_util.keystr(path).lstrip("."): np.asarray(leaf) for path, leaf in leaves}
-
-
-def write_shard(
-    folder: pathlib.Path, index: int, episodes: Any, *, kind: str, config: Any, faults: dict[str, Any]
-) -> None:
-    """Write one shard.
-
-    Args:
-      folder: the data set.
-      index: the shard's number.
-      episodes: a struct of `KINDS[kind]` with a leading `[B]` axis.
-      kind: a key of KINDS.
-      config: JSON-able: what made it, the seed included.
-      faults: what was counted on the way.
-    """
-    columns, coded = codec.encode(_columns(episodes))
-    arrays, specs = [], {}
-    for name, value in columns.items():
-        flat = np.ascontiguousarray(value).reshape(len(value), -1)
-        arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(flat.reshape(-1)), flat.shape[1]))
-        specs[name] = {"dtype": str(value.dtype), "shape": list(value.shape[1:])} | coded.get(name, {})
-    meta = {
-        "schema_version": SCHEMA_VERSION,
-        "kind": kind,
-        "shard": index,
-        "columns": specs,
-        "config": config,
-        "faults": faults,
-        "versions": files.package_versions(),
-    }
-    table = pa.Table.from_arrays(arrays, names=list(columns))
-    table = table.replace_schema_metadata({_META: json.dumps(meta).encode()})
-    sink = pa.BufferOutputStream()
-    pq.write_table(
-        table,
-        sink,
-        compression="zstd",
-        compression_level=COMPRESSION,
-        use_dictionary=False,
-        column_encoding={f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in coded},
-        write_page_checksum=True,
-    )
-    files.write_atomically(shard_path(folder, index), sink.getvalue().to_pybytes())
-
-
-def read_meta(path: pathlib.Path) -> dict[str, Any]:
-    """A shard's own account of itself.
-
-    Raises:
-      UserError: the file is missing, damaged, not a shard, or of another schema version.
-    """
-    try:
-        meta = json.loads(pq.read_schema(path).metadata[_META])
-    except FileNotFoundError:
-        raise UserError(f"shard {path}: not found; generate it again with dipn-datagen") from None
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
-        raise DamagedShard(
-            f"shard {path}: truncated, damaged or not a shard of this project; run dipn-datagen repair {path.parent}"
-        ) from None
-    if meta["schema_version"] != SCHEMA_VERSION:
-        raise UserError(
-            f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it anew elsewhere"
-        )
-    return meta
-
-
-def count(path: pathlib.Path) -> int:
-    """Episodes in a shard."""
-    read_meta(path)
-    return pq.read_metadata(path).num_rows
-
-
-def read_shard(path: pathlib.Path, *, kind: str) -> Any:
-    """The episodes of a shard: a struct of `KINDS[kind]` with a leading `[B]` axis, numpy.
-
-    Raises:
-      UserError: see `read_meta`; or the shard is of another kind.
-    """
-    meta = read_meta(path)
-    if meta["kind"] != kind:
-        raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
-    try:
-        table = pq.read_table(path, page_checksum_verification=True)
-    except (pa.ArrowException, OSError):
-        raise DamagedShard(f"shard {path}: damaged; run dipn-datagen repair {path.parent}") from None
-    columns = {}
-    for name, spec in meta["columns"].items():
-        flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        columns[name] = flat.astype(spec["dtype"]).reshape(len(table), *spec["shape"])
-    coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
-    return _assemble(KINDS[kind], codec.decode(columns, coded))
-
-
-def _assemble(struct: type, columns: dict[str, np.ndarray], prefix: str = "") -> Any:
-    nested = {"scene": structs.Scene, "push": structs.Push, "grasp": structs.Grasp}
-    values = {}
-    for field in dataclasses.fields(struct):
-        name = prefix + field.name
-        values[field.name] = (
-            _assemble(nested[field.name], columns, f"{name}.") if field.name in nested else columns[name]
-        )
-    return struct(**values)
+"""Name of the file that lists the shards of a data set."""
 
 
 def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """Account for every readable shard of the folder in `manifest.json`; returns it.
+    """List every readable shard of the folder in `manifest.json`, and return the manifest.
 
-    Entries of shards that are gone are dropped; a shard that is listed already is not read again. Workers that
-    share the folder take turns.
+    Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
+    folder take turns.
     """
     with (folder / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -166,31 +31,33 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
+    """Write the manifest anew, as `update_manifest` says, and return it."""
     known = _read_manifest(folder)["shards"] if (folder / MANIFEST).exists() else {}
-    shards: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for path in sorted(folder.glob("shard-*.parquet")):
         entry = known.get(path.name)
         if entry is None or entry["bytes"] != path.stat().st_size:
-            meta = read_meta(path)
+            meta = shards.read_meta(path)
             entry = {
-                "episodes": count(path),
+                "episodes": shards.count(path),
                 "bytes": path.stat().st_size,
                 "sha256": files.file_sha256(path),
                 "kind": meta["kind"],
                 "faults": meta["faults"],
             }
-        shards[path.name] = entry
+        entries[path.name] = entry
     manifest = {
-        "schema_version": SCHEMA_VERSION,
-        "kind": next((entry["kind"] for entry in shards.values()), None),
-        "episodes": sum(entry["episodes"] for entry in shards.values()),
-        "shards": shards,
+        "schema_version": shards.SCHEMA_VERSION,
+        "kind": next((entry["kind"] for entry in entries.values()), None),
+        "episodes": sum(entry["episodes"] for entry in entries.values()),
+        "shards": entries,
     }
     files.write_json(folder / MANIFEST, manifest)
     return manifest
 
 
 def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
+    """Return the manifest of a data set; raise UserError if it is missing or damaged."""
     path = folder / MANIFEST
     try:
         manifest = json.loads(path.read_text())
@@ -205,7 +72,7 @@ def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
-    """Shards that are missing, damaged or unlisted, each with what is wrong; empty if all is well."""
+    """Return the shards that are missing, damaged or unlisted, each with what is wrong; empty if none is."""
     manifest, problems = _read_manifest(folder), []
     for name, entry in manifest["shards"].items():
         path = folder / name
@@ -216,14 +83,14 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
         elif files.file_sha256(path) != entry["sha256"]:
             problems.append((path, "SHA-256 differs from the manifest's"))
         else:
-            read_meta(path)  # of this schema version
+            shards.read_meta(path)  # of this schema version
     listed = set(manifest["shards"])
     problems += [(p, "not in the manifest") for p in sorted(folder.glob("shard-*.parquet")) if p.name not in listed]
     return problems
 
 
 def repair(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Set damaged shards aside as `*.damaged`, and rebuild the manifest from the rest; returns what was set aside.
+    """Rename damaged shards to `*.damaged`, rebuild the manifest from the rest, and return the paths of the former.
 
     Raises:
       UserError: the folder is no data set, or holds shards of another schema version, which are not damaged.
@@ -237,9 +104,9 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     removed = []
     for path in sorted(folder.glob("shard-*.parquet")):
         try:
-            read_shard(path, kind=read_meta(path)["kind"])
+            shards.read_shard(path, kind=shards.read_meta(path)["kind"])
             good = path.name not in known or files.file_sha256(path) == known[path.name]["sha256"]
-        except DamagedShard:
+        except shards.DamagedShard:
             good = False
         if not good:
             path.rename(path.with_suffix(".parquet.damaged"))
@@ -250,14 +117,14 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def summary(folder: pathlib.Path) -> dict[str, Any]:
-    """What a data set holds: counts, bytes, faults, and the config and versions of its first shard."""
+    """Describe a data set: counts, bytes, faults, and the config and versions of its first shard."""
     manifest = _read_manifest(folder)
     faults: dict[str, int] = {}
     for entry in manifest["shards"].values():
         for name, count in entry["faults"].items():
             faults[name] = faults.get(name, 0) + count
     first = next(iter(manifest["shards"]), None)
-    meta = read_meta(folder / first) if first else {}
+    meta = shards.read_meta(folder / first) if first else {}
     return {
         "kind": manifest["kind"],
         "episodes": manifest["episodes"],
@@ -288,11 +155,11 @@ def read_episodes(folder: pathlib.Path | str) -> Any:
 
 
 def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
-    """A whole data set in memory (a few kilobytes an episode), after checking every shard.
+    """Load a whole data set into memory (a few kilobytes an episode), after checking every shard.
 
     Args:
       folder: the data set.
-      kind: a key of KINDS.
+      kind: a key of `shards.KINDS`.
 
     Returns:
       The episodes `[B, ...]` in the order of the shards, and a fingerprint of the data set.
@@ -310,10 +177,10 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
         )
     if not manifest["shards"]:
         raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
-    shards = [read_shard(folder / name, kind=kind) for name in manifest["shards"]]
-    widths = {shard.scene.shape.shape[1] for shard in shards}
+    parts = [shards.read_shard(folder / name, kind=kind) for name in manifest["shards"]]
+    widths = {part.scene.shape.shape[1] for part in parts}
     if len(widths) > 1:
         raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
-    episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *shards)
+    episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     text = json.dumps([entry["sha256"] for entry in manifest["shards"].values()])
     return episodes, hashlib.sha256(text.encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Work that was interrupted goes on where it stopped: its state is kept beside its results until it ends."""
+"""State of unfinished work, kept beside its results, so that interrupted work continues where it stopped."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from dipn_jax.storage import checkpoint
 
 
 class Partial:
-    """The state of work under way, in `OUT/partial.pickle`; that of other settings is not taken up."""
+    """The state of unfinished work, in `OUT/partial.pickle`; a state of other settings is ignored."""
 
     def __init__(self, out: pathlib.Path, settings: dict[str, Any], *, inputs: Sequence[pathlib.Path] = ()) -> None:
-        """Look for a state.
+        """Prepare to load and save the state of work with these settings.
 
         Args:
           out: folder of the results.
           settings: options that the results depend on.
-          inputs: files and runs that they depend on; their content counts, not their name.
+          inputs: files and runs that the results depend on, by content, not by name.
         """
         self.path = out / "partial.pickle"
         content = [_fingerprint(path) for path in inputs]
@@ -29,7 +29,7 @@ class Partial:
         self.identity = json.dumps([named, content, files.package_versions()])
 
     def load(self, fresh: Any) -> Any:
-        """The state kept, or `fresh` where there is none for these settings."""
+        """Return the state kept, or `fresh` if there is none for these settings."""
         try:
             identity, state = pickle.loads(self.path.read_bytes())
         except Exception:  # a foreign or damaged pickle can raise anything; then there is no state
@@ -37,16 +37,16 @@ class Partial:
         return state if identity == self.identity else fresh
 
     def save(self, state: Any) -> None:
-        """Keep `state` (anything that pickles), atomically."""
+        """Keep `state` (anything that can be pickled), atomically."""
         files.write_atomically(self.path, pickle.dumps((self.identity, state)))
 
     def finish(self) -> None:
-        """The results are written: drop the state."""
+        """Delete the state, once the results are written."""
         self.path.unlink(missing_ok=True)
 
 
 def _fingerprint(path: pathlib.Path) -> str:
-    """Of a file, or of the newest checkpoint of a run."""
+    """Return the SHA-256 of a file, or of the newest checkpoint of a run."""
     if path.is_file():
         return files.file_sha256(path)
     found = checkpoint.newest(path)

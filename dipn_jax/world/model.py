@@ -8,12 +8,15 @@ traces geometry (MJX) replaces its vertices, and compiles once for all scenes.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from dipn_jax.engine import PhysicsConfig
 from dipn_jax.structs import Scene
 from dipn_jax.workspace import GRIPPER, Gripper
 from dipn_jax.world import shapes
 
+MARK = "dipn_jax"
+"""Name of a custom number in our MJCF, by which the patches of MJX know our models (`physics.patches`)."""
 GRIPPER_DOF = 6
 """x, y, z, yaw, left finger, right finger; then 7 numbers of qpos (6 of qvel) an object."""
 OBJECT_FRICTION_RATIO = 0.5 / 0.35
@@ -89,8 +92,8 @@ def _object(scene: Scene, slot: int, generic: bool, inertia: np.ndarray) -> tupl
     return f'<body name="o{slot}"><freejoint name="o{slot}"/>{inertial}{"".join(geoms)}</body>', "".join(assets)
 
 
-def inertias(scene: Scene) -> np.ndarray:
-    """Diagonal inertia `[N, 3]`; that of a harmless ball for empty slots."""
+def inertias(scene: Scene) -> Float[np.ndarray, "*b N 3"]:
+    """Diagonal inertia (kg m^2); that of a harmless ball for empty slots."""
     spread = shapes.UNIT_VARIANCE[np.maximum(scene.shape, 0)] * np.asarray(scene.size, float) ** 2
     inertia = np.asarray(scene.mass, float)[:, None] * (spread.sum(-1, keepdims=True) - spread)
     return np.where((np.asarray(scene.shape) >= 0)[:, None], inertia, 1e-4)
@@ -172,7 +175,7 @@ def mjcf(
  iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="1e-8" jacobian="{jacobian}"
  sleep_tolerance="{c.sleep}"> <flag multiccd="enable" autoreset="disable"{sleep}/></option>
 <custom><numeric name="max_geom_pairs" data="{pairs}"/>
- <numeric name="max_contact_points" data="{contacts}"/></custom>
+ <numeric name="max_contact_points" data="{contacts}"/><numeric name="{MARK}" data="1"/></custom>
 <default><geom solref="{c.solref}" solimp="{c.solimp}"/><pair condim="3" solref="{c.solref}" solimp="{c.solimp}"/>
  <default class="object"><geom contype="1" conaffinity="3" condim="3"/></default>
  <default class="link">

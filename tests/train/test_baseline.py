@@ -75,9 +75,9 @@ def test_tables_that_are_done_with_are_set_anew(engine: Any) -> None:
 def test_exploration_fades_and_reactive_grasps_never_push() -> None:
     now = _look(_heights(*[1000] * 400), 0.5)
     now = now.replace(push_value=np.full(400, 1.0))
-    early, late = (acting.choose(now, np.random.default_rng(0), n, may_push=True)[0].mean() for n in (0, 100_000))
+    early, late = (acting.explore(now, np.random.default_rng(0), n, may_push=True)[0].mean() for n in (0, 100_000))
     assert early == pytest.approx(0.75, abs=0.07) and late == pytest.approx(0.95, abs=0.04)
-    assert not acting.choose(now, np.random.default_rng(0), 0, may_push=False)[0].any()
+    assert not acting.explore(now, np.random.default_rng(0), 0, may_push=False)[0].any()
 
 
 def _flat_scores(images: jax.Array) -> jax.Array:
@@ -127,7 +127,7 @@ def test_the_published_form_looks_and_learns(engine: Any) -> None:
     import functools
 
     import optax
-    from dipn_jax.train.grasp import PHASE, WINDOWS, Window
+    from dipn_jax.train.grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window
     from dipn_jax.train.loop import make_step
     from flax import nnx
 
@@ -140,7 +140,7 @@ def test_the_published_form_looks_and_learns(engine: Any) -> None:
     keys = jax.random.split(jax.random.key(0), 2)
     seen = jax.eval_shape(look, params, rest, keys, played.scene, played.poses, np.ones(2, bool))
     assert seen.push_value.shape == seen.grasp_value.shape == (2,)
-    wide = WINDOWS["paper"] + 2 * PHASE
+    wide = WINDOW_PIXELS["paper"] + 2 * SHIFT_PIXELS
     some = Window(
         np.zeros((2, wide, wide), np.float16), np.zeros((2, wide, wide), np.int8), np.zeros((2, 3, 3)), np.zeros(2)
     )
@@ -154,7 +154,7 @@ def test_the_published_form_looks_and_learns(engine: Any) -> None:
 def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
     """A network fits two outcomes that differ in nothing but where they were tried."""
     import optax
-    from dipn_jax.train.grasp import PHASE, WINDOWS, windows
+    from dipn_jax.train.grasp import SHIFT_PIXELS, WINDOW_PIXELS, windows
     from dipn_jax.train.loop import make_step
     from flax import nnx
 
@@ -169,7 +169,7 @@ def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
     target = np.array([1.0, 0.0], np.float32)
     batch = windows(
         GraspEpisode(first[0], first[1], first[1], aim, held, target, np.zeros(2, int)),
-        pixels=WINDOWS["compact"] + 2 * PHASE,
+        pixels=WINDOW_PIXELS["compact"] + 2 * SHIFT_PIXELS,
     )
     batch = structs.take(batch, np.arange(32) % 2)  # each is moved by some pixels of its own
     model = checkpoint.build("vpg", VpgConfig(parts=("grasp",), width=8, coarse=8))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from dipn_jax.train import grasp as grasp_task
 from dipn_jax.train import online
-from dipn_jax.train.grasp import PHASE, GraspTask, PretrainTask, view
+from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
 from dipn_jax.train.push import PushTask
 from flax import nnx
@@ -146,7 +146,7 @@ def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path])
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig(width=8))
     episodes = structs.take(task.train_set, np.arange(6))
-    begin = jax.random.randint(jax.random.key(0), (6, 2), 0, 2 * PHASE)
+    begin = jax.random.randint(jax.random.key(0), (6, 2), 0, 2 * SHIFT_PIXELS)
     images, pixel = view(task.fetch(np.arange(6)), begin)
     height = np.asarray(images)[np.arange(6), pixel[:, 0], pixel[:, 1], 3]
     _, row, col = candidates.grasp_index(episodes.grasp).T

@@ -34,7 +34,7 @@ def test_scores_by_tables_are_scores_of_turned_maps() -> None:
     block = jnp.array([0.9, 0.1, 0.4, 0.05])
     image = jnp.broadcast_to(table, (224, 224, 4)).at[80:130, 60:90].set(block)
     half = jnp.asarray(grasp_angles())[:8]
-    views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, grasp.VIEW) + table)(half)
+    views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, grasp.VIEW_PIXELS) + table)(half)
     plain = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, 224))(nnx.sigmoid(model(views)), half)
     plain = plain.at[:, image[..., 3] == 0].set(0.0)  # no grasp is centred on empty table
     assert plain.max() > 0.1

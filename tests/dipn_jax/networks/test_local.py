@@ -41,7 +41,7 @@ def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled
     for i in range(6):
         table = structs.take(seen, i)
         plain, fast = (jax.device_get(scores["decide"](table, quick)) for quick in (False, True))
-        many += plain.candidates.feasible.sum() > local.FEW
+        many += plain.candidates.feasible.sum() > local.SCORED_WHOLE
         np.testing.assert_array_equal(plain.candidates.feasible, fast.candidates.feasible)
         assert plain.best == fast.best and plain.is_push == fast.is_push
         equal = np.isclose(plain.values, fast.values, rtol=1e-4) & plain.candidates.feasible
@@ -63,7 +63,7 @@ def test_rough_means_rank_nearly_as_whole_images_do(settled: Any, scores: dict[s
     def roughly(images: Any) -> Any:
         every = np.ones(8, bool)
         look = lambda turns: local.rough_means(scores["gn"], now, before, images, every, turns=turns)  # noqa: E731
-        return np.asarray(jax.jit(lambda: jnp.stack([look(turns) for turns in local.TURNS]))())
+        return np.asarray(jax.jit(lambda: jnp.stack([look(turns) for turns in local.LOOK_TURNS]))())
 
     rough = roughly(others)
     change = np.asarray(whole) - np.asarray(whole).min()

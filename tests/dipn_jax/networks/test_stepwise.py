@@ -20,7 +20,7 @@ def test_outlines_are_how_far_the_pixels_reach(settled: Any) -> None:
         for which, mask in enumerate((label == i, (label == i) & (height > GRIPPER.push_tip))):
             rows, cols = np.nonzero(np.asarray(mask))
             points = np.stack([at[cols], at[rows]], -1) - np.asarray(centers[i])
-            want = (points @ normals.T).max(0) if len(points) else np.zeros(push_frame.DIRECTIONS)
+            want = (points @ normals.T).max(0) if len(points) else np.zeros(push_frame.OUTLINE_DIRECTIONS)
             np.testing.assert_allclose(got[i, :, which], want, atol=1e-5)
 
 

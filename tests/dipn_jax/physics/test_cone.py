@@ -63,13 +63,6 @@ def test_the_least_cost_is_found_in_float32(sticking: bool) -> None:
         assert _cost(exact, found) <= best.fun * (1 + 1e-5), (_cost(exact, found), best.fun)
 
 
-def test_a_second_registration_changes_nothing() -> None:
-    cone.register()
-    once = cone.solver.solve
-    cone.register()
-    assert cone.solver.solve is once
-
-
 @pytest.mark.parametrize("multiple", [1e-3, 0.3, 1.0, 10.0, 1000.0])
 def test_the_line_search_finds_minima_near_and_far(multiple: float) -> None:
     p = _problem(np.random.default_rng(1), sticking=False)

@@ -17,7 +17,7 @@ import pytest
 
 from dipn_jax import geometry
 from dipn_jax.errors import UserError
-from dipn_jax.physics import mjx, prisms
+from dipn_jax.physics import colliders, mjx, prisms
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.native import NativeEngine
 from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene, Trajectory
@@ -29,7 +29,7 @@ POSITION_TOLERANCE = 0.003
 """Metres between the engines after 5 cm of a push: float32 and another solver. On 32 random scenes (docs/world.md) the
 90th percentile is 1.3 mm, as contacts between objects multiply differences."""
 DEPTH_TOLERANCE = 1e-4
-"""Metres of contact depth; 0.05 mm of it is `prisms.PREFER_FACE`. Measured: 1e-8 on these pairs."""
+"""Metres of contact depth; 0.05 mm of it is `colliders.FACE_PREFERENCE`. Measured: 1e-8 on these pairs."""
 DEEPEST = 0.003
 """Metres: deeper than any contact of an episode. Far deeper, clipping a face can cut off the deepest corner."""
 CLASS = {name: i for i, name in enumerate(shapes.CLASSES)}
@@ -261,11 +261,11 @@ def _depths(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
     pos = poses[..., None, :3] + jnp.einsum("bnij,bnpj->bnpi", turn, parts.center)
     mat = jnp.broadcast_to(turn[:, :, None], (*pos.shape, 3))
     size = jnp.broadcast_to(parts.alive[..., None], pos.shape).astype(jnp.float32)
-    hulls = prisms.ConvexInfo(pos, mat, size, **vars(parts.mesh))
+    hulls = colliders.ConvexInfo(pos, mat, size, **vars(parts.mesh))
     first, second = (jax.tree.map(lambda leaf, i=i: leaf[:, i], hulls) for i in (0, 1))
-    each = jax.vmap(jax.vmap(prisms.convex_prism, (None, 0)), (0, None))
-    plane = prisms.GeomInfo(jnp.zeros(3), jnp.eye(3), jnp.zeros(3))
-    table = jax.vmap(jax.vmap(prisms.plane_prism, (None, 0)), (None, 0))(plane, first)
+    each = jax.vmap(jax.vmap(colliders.convex_prism, (None, 0)), (0, None))
+    plane = colliders.GeomInfo(jnp.zeros(3), jnp.eye(3), jnp.zeros(3))
+    table = jax.vmap(jax.vmap(colliders.plane_prism, (None, 0)), (None, 0))(plane, first)
     return jax.vmap(each)(first, second)[0].min(-1), table[0].min(-1)
 
 
@@ -287,11 +287,11 @@ def test_contact_depths_agree_with_mujoco_c() -> None:
                 assert abs(found[b, i, j] - wanted) < DEPTH_TOLERANCE, (b, i, j, found[b, i, j], wanted)
                 touching += 1
             elif wanted > DEPTH_TOLERANCE:
-                assert found[b, i, j] == prisms.APART
+                assert found[b, i, j] == colliders.APART_DISTANCE
         vertices = shapes.UNIT_VERTICES[one.shape[0]] * one.size[0]
         turn = data.body("o0").xmat.reshape(3, 3)
         used = shapes.CORNERS_USED[one.shape[0]] > 0
         low = (vertices[used] @ turn.T)[..., 2].min(-1) + poses[b, 0, 2]
-        np.testing.assert_allclose(table[b][used], np.where(low < 0, low, prisms.APART), atol=1e-6)
-        assert (table[b][~used] == prisms.APART).all()
+        np.testing.assert_allclose(table[b][used], np.where(low < 0, low, colliders.APART_DISTANCE), atol=1e-6)
+        assert (table[b][~used] == colliders.APART_DISTANCE).all()
     assert touching > 10

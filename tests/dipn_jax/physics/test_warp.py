@@ -48,7 +48,7 @@ def test_what_is_not_finite_or_outside_is_a_fault_of_its_own_episode(warp_engine
 
 def test_lack_of_room_for_contacts_is_a_fault(warp_engine: Any, settled: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2]
-    for limits in (("CONTACTS", "PAIRS"), ("ROWS",)):
+    for limits in (("CONTACTS_PER_OBJECT", "PAIRS_PER_OBJECT"), ("ROWS_PER_OBJECT",)):
         with monkeypatch.context() as patch:
             for limit in limits:
                 patch.setattr(warp, limit, 1)

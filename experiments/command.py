@@ -1,0 +1,87 @@
+"""The command line that every experiment shares."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+from collections.abc import Callable, Sequence
+
+from dipn_jax import console
+from experiments import runs
+from experiments.runs import Run
+
+ListRuns = Callable[[pathlib.Path], list[Run]]
+"""The runs of an experiment, in order, for the folder that all results stand in."""
+
+WritePage = Callable[[pathlib.Path], None]
+"""Writes an experiment's page from what its runs left in that folder."""
+
+
+def main(
+    module: str,
+    description: str,
+    list_runs: ListRuns,
+    *,
+    folder: str = "results",
+    page: WritePage | None = None,
+    arguments: Sequence[str] | None = None,
+) -> int:
+    """Entry point of an experiment; returns the exit code.
+
+    Args:
+      module: its name, for the help.
+      description: its docstring.
+      list_runs: its runs.
+      folder: where results go unless `--out` says otherwise.
+      page: what to write when all runs are complete.
+      arguments: of the command line; those of the process if not given.
+    """
+    options = _parser(module, description, folder).parse_args(arguments)
+
+    def work() -> int:
+        listed = list_runs(options.out)
+        chosen = runs.select(listed, options.only)
+        if options.list:
+            return _show(chosen)
+        found = runs.keys(listed)
+        if options.dry_run:
+            return _rehearse(chosen, found)
+        console.require_out(options.out)
+        code = runs.carry_out(chosen, found)
+        if not code and page and len(chosen) == len(listed):
+            page(options.out)
+        return code
+
+    return console.exit_code(work)
+
+
+def _parser(module: str, description: str, folder: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"python -m experiments.{module}",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--list", action="store_true", help="show the names of the runs and their commands")
+    parser.add_argument("--dry-run", action="store_true", help="check every command and say what is left to do")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help="these runs and those that they need; no page is written"
+    )
+    parser.add_argument(
+        "--out", type=pathlib.Path, default=pathlib.Path(folder), metavar="FOLDER", help=f"of results ({folder})"
+    )
+    return parser
+
+
+def _show(chosen: Sequence[Run]) -> int:
+    for run in chosen:
+        console.say(f"{run.name}\n  {run.line}")
+    return 0
+
+
+def _rehearse(chosen: Sequence[Run], found: dict[str, str]) -> int:
+    """Parse every command as it would be; say which are complete."""
+    for number, run in enumerate(chosen, 1):
+        runs.parse(run)
+        state = "complete" if runs.is_complete(run, found[run.name]) else run.line
+        console.say(f"[{number}/{len(chosen)}] {run.name}: {state}")
+    return 0

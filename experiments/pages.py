@@ -1,0 +1,126 @@
+"""The pages of results in docs: their tables, and a box with the machines, commits and seeds behind them."""
+
+from __future__ import annotations
+
+import pathlib
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+from dipn_jax import console, files
+from dipn_jax.errors import UserError
+from experiments import runs
+from experiments.runs import NOT_RECORDED, Run
+
+DOCS = pathlib.Path(__file__).parent.parent / "docs"
+
+BOX_BEGINS, BOX_ENDS = "<!-- box: begin -->", "<!-- box: end -->"
+"""Lines of a page between which its box stands."""
+
+BOX_WIDTH = 110
+"""Characters of a line of the box."""
+
+MADE = "made"
+"""Key of a page's JSON under which `made` stands; all other keys are numbers."""
+
+
+def made(listed: Sequence[Run]) -> dict[str, Any]:
+    """What the stamps of runs say of how they were made, by name of run, as JSON."""
+    facts = ("made_by", "seed", "versions")
+    stamps = {run.name: runs.read_stamp(run) for run in listed}
+    return {name: {key: stamp[key] for key in facts if key in stamp} for name, stamp in stamps.items()}
+
+
+def box(values: dict[str, Any]) -> str:
+    """The box of a page, as Markdown: how many figures, and the machines, commits, versions and seeds of its runs.
+
+    Args:
+      values: a page's JSON: numbers by name, and under `made`, if they are known, the facts about its runs.
+    """
+    found = values.get(MADE, {})
+    lines = [f"figures: {sum(key != MADE for key in values):,}"]
+    for title, describe in (("machine", _machines), ("commit", _commits), ("versions", _versions), ("seed", _seeds)):
+        lines.append(f"{title}: {_grouped({name: describe(facts) for name, facts in found.items()})}")
+    wrapped = [textwrap.fill(line, BOX_WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in lines]
+    return "\n".join(["```", *wrapped, "```"]) + "\n"
+
+
+def _machines(facts: dict[str, Any]) -> str:
+    names = [
+        each["processor"] + (f", {each['cores']} cores" if each["cores"] else "") for each in facts.get("made_by", [])
+    ]
+    return " and ".join(dict.fromkeys(names)) or NOT_RECORDED
+
+
+def _commits(facts: dict[str, Any]) -> str:
+    return " and ".join(dict.fromkeys(each["commit"] for each in facts.get("made_by", []))) or NOT_RECORDED
+
+
+def _versions(facts: dict[str, Any]) -> str:
+    found = facts.get("versions", {})
+    return ", ".join(f"{name} {found[name]}" for name in ("jax", "mujoco") if name in found) or NOT_RECORDED
+
+
+def _seeds(facts: dict[str, Any]) -> str:
+    if "seed" not in facts:
+        return NOT_RECORDED
+    return "none" if facts["seed"] is None else f"{facts['seed']:,}"
+
+
+def _grouped(by_run: dict[str, str]) -> str:
+    """Each value once, with the runs that have it; the one that most have goes last, without their names."""
+    if not by_run:
+        return NOT_RECORDED
+    groups: dict[str, list[str]] = {}
+    for run, value in by_run.items():
+        groups.setdefault(value, []).append(run)
+    *few, most = sorted(groups, key=lambda value: len(groups[value]))
+    named = [f"{value} ({', '.join(groups[value])})" for value in few]
+    return "; ".join([*named, f"{most} (all others)" if few else most])
+
+
+def with_box(text: str, content: str) -> str:
+    """The page `text` with `content` as its box.
+
+    Raises:
+      UserError: the page has no markers for it.
+    """
+    before, begins, rest = text.partition(f"{BOX_BEGINS}\n")
+    _, ends, after = rest.partition(f"{BOX_ENDS}\n")
+    if not begins or not ends:
+        raise UserError(f"the page has no place for its box: add the lines {BOX_BEGINS} and {BOX_ENDS}")
+    return f"{before}{begins}{content}{ends}{after}"
+
+
+def with_table(text: str, table: str) -> str:
+    """The page `text` with `table` in place of the one that has the same heading.
+
+    Raises:
+      UserError: no table of the page, or more than one, has that heading.
+    """
+    heading = "".join(table.splitlines(keepends=True)[:2])
+    before, found, after = text.partition(heading)
+    if not found or heading in after:
+        raise UserError(f"the page needs one table with this heading: {heading.splitlines()[0]}")
+    rows = after.splitlines(keepends=True)
+    while rows and rows[0].startswith("|"):
+        rows.pop(0)
+    return before + table + "".join(rows)
+
+
+def write(name: str, values: dict[str, Any], tables: Sequence[str], *, docs: pathlib.Path) -> None:
+    """Write `NAME.json` and put the tables and the box into `NAME.md`, which must have places for them.
+
+    Args:
+      name: of the page.
+      values: its JSON.
+      tables: as Markdown.
+      docs: folder of the page.
+    """
+    page = docs / f"{name}.md"
+    text = with_box(page.read_text(), box(values))
+    for table in tables:
+        text = with_table(text, table)
+    files.write_json(docs / f"{name}.json", values)
+    files.write_atomically(page, text.encode())
+    console.say(f"{page}: {len(tables)} tables")

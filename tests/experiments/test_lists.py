@@ -1,0 +1,69 @@
+"""The experiments themselves: every command is one that the real command takes."""
+
+import pathlib
+from types import ModuleType
+
+import pytest
+
+from experiments import clearing, demo, grasping, push_prediction, runs
+
+COUNTS = {demo: 11, push_prediction: 52, grasping: 31, clearing: 41}
+"""Runs of each experiment."""
+
+each = pytest.mark.parametrize("experiment", COUNTS, ids=lambda module: module.__name__.rpartition(".")[2])
+
+
+@each
+def test_a_dry_run_takes_every_command_and_makes_nothing(
+    experiment: ModuleType, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert experiment.main(["--dry-run", "--out", str(tmp_path / "out")]) == 0
+    said = capfd.readouterr()
+    assert said.out.count("\n") == COUNTS[experiment] and not said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@each
+def test_every_folder_that_a_run_reads_is_written_before(experiment: ModuleType) -> None:
+    root = pathlib.Path("results")
+    listed = experiment.list_runs(root)
+    assert len({run.name for run in listed}) == len({run.out for run in listed}) == len(listed)
+    written: set[str] = set()
+    for run in listed:
+        read = {word for word in run.command if word.startswith(f"{root}/")} - {str(run.out)}
+        assert read <= written, run.name
+        written.add(str(run.out))
+    assert len(runs.keys(listed)) == len(listed)
+
+
+@each
+def test_a_list_and_a_name_that_is_none(experiment: ModuleType, capfd: pytest.CaptureFixture[str]) -> None:
+    assert experiment.main(["--list"]) == 0
+    assert capfd.readouterr().out.count("\n  dipn-") == COUNTS[experiment]
+    assert experiment.main(["--only", "nothing"]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+
+
+def test_the_recipes_that_figures_were_made_with() -> None:
+    root = pathlib.Path("results")
+    push, grasp, clear = (
+        {run.name: run for run in module.list_runs(root)} for module in (push_prediction, grasping, clearing)
+    )
+    assert push["runs/51000-2"].line == (
+        "dipn-train push --eval-every 1000 --save-every 1000 --data results/push/data --limit 51000 --steps 10000 "
+        "--seed 2 --out results/push/runs/51000-2"
+    )
+    assert push["with-concave"].line == (
+        "dipn-eval prediction --scenes 500 --objects paper --no-segmented --items concave concave_slim "
+        "--push-net results/push/runs/1500-0 --no-physics --out results/push/with-concave"
+    )
+    data = " ".join(f"results/grasp/{name}" for name in ("first", "second", "third", "fourth", "fifth"))
+    assert grasp["shipped"].line == (
+        f"dipn-train grasp --batch 64 --data {data} --steps 2200 --learning-rate 1e-3 --init results/grasp/fourfold "
+        "--out results/grasp/shipped"
+    )
+    assert clear["table/dqn-gn-30"].line == (
+        "dipn-eval clear --cases random --objects 30 --instances 30 --label paper --method dqn+gn "
+        "--value-net results/clear/dqn --grasp-net results/clear/gn --out results/clear/table/dqn-gn-30"
+    )
+    assert runs.keys(list(clear.values()))["push/data"] == runs.keys(list(push.values()))["data"]

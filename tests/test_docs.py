@@ -1,0 +1,199 @@
+"""The pages that people read: links lead somewhere, commands exist, Python runs, figures are those that are kept."""
+
+import contextlib
+import functools
+import importlib
+import json
+import pathlib
+import re
+import shlex
+import shutil
+from collections.abc import Callable
+
+import pytest
+import tyro
+from dipn_jax.eval.report import paper
+
+from benchmarks.__main__ import BENCHMARKS
+from dipn_jax import console, files
+from experiments import moving_picture, runs, tutorial_pictures
+
+ROOT = pathlib.Path(__file__).parent.parent
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
+BIN = ".venv/bin/"
+SHELL = re.compile(r"^```bash\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+SMALL = {
+    "--episodes": "24", "--steps": "2", "--objects": "1:3", "--candidates": "4", "--distances": "0.05:0.1:0.05",
+    "--scenes": "2", "--instances": "1",
+}  # fmt: skip
+"""Options that make a command of the tutorial as big as it is -> what a test gives instead."""
+ALWAYS = {
+    "dipn-datagen": ["--objects", "1:3", "--shard-size", "24"],
+    "dipn-train": ["--steps", "2", "--batch", "4", "--eval-every", "2", "--save-every", "2"],
+    "dipn-eval": [],
+}
+"""Options that a test adds to those commands where they make or learn something."""
+
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+
+
+def commands(page: pathlib.Path) -> list[list[str]]:
+    """The words of every shell command on a page, without `.venv/bin/` and comments."""
+    lines = "\n".join(block[1] for block in SHELL.finditer(page.read_text())).replace("\\\n", " ").splitlines()
+    return [[word.removeprefix(BIN) for word in shlex.split(line, comments=True)] for line in lines if line.strip()]
+
+
+def parsed(words: list[str]) -> bool:
+    """Whether a command's own parser takes its words; nothing is carried out."""
+    program, *arguments = words
+    called: list[str] = []
+
+    def stub(name: str, command: Callable[..., None]) -> Callable[..., None]:
+        return functools.wraps(command)(lambda **_: called.append(name))
+
+    known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
+    with contextlib.suppress(SystemExit):
+        console.run(program, {name: stub(name, command) for name, command in known.items()}, arguments)
+    return called == arguments[:1]
+
+
+@each_page
+def test_lines_are_short_and_links_lead_somewhere(page: pathlib.Path) -> None:
+    text = page.read_text()
+    for number, line in enumerate(text.splitlines(), 1):
+        assert len(line) <= 120 or line.startswith("|"), f"{page}:{number}"
+    for link in re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text)):
+        target, _, anchor = link.partition("#")
+        assert not target.startswith("http"), f"{page}: {link}"
+        there = (page.parent / target).resolve() if target else page
+        assert there.exists(), f"{page}: {link}"
+        if anchor:
+            heads = re.findall(r"^#+ (.*)$", there.read_text(), re.MULTILINE)
+            assert anchor in [head.lower().replace(" ", "-") for head in heads], f"{page}: {link}"
+
+
+@each_page
+def test_files_of_this_project_that_a_page_names_exist(page: pathlib.Path) -> None:
+    for name in re.findall(r"`((?:\w+/)+[\w.]+\.(?:py|json|md))`", page.read_text()):
+        assert any((base / name).exists() for base in (ROOT, ROOT / "dipn_jax")) or name.startswith(
+            ("demo/", "mujoco/")
+        ), name
+
+
+@each_page
+def test_commands_are_ones_that_exist(page: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    for words in commands(page):
+        match words:
+            case ["make", *targets]:
+                assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets), words
+            case ["python", "-m", "benchmarks", *names]:
+                assert all(name in BENCHMARKS for name in names), words
+            case ["python", "-m", "pytest", *options]:
+                assert all((ROOT / option).exists() for option in options if option.endswith(".py")), words
+            case ["python", "-m", "experiments.moving_picture", *options]:
+                tyro.cli(functools.wraps(moving_picture.main)(lambda **_: None), args=options)
+            case [program, *_]:
+                assert program in runs.PROGRAMS and parsed(words), words
+    assert not capfd.readouterr().err
+
+
+def test_the_readme_fits_on_a_screen_and_its_table_is_the_kept_one() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert text.count("\n") <= 110 and (ROOT / "docs" / "clearing.gif").stat().st_size <= 1.5e6
+    values = files.read_json(ROOT / "docs" / "clearing.json")
+    rows = {
+        "DIPN + GN, shipped networks": ("large/dipn+gn", None),
+        "DIPN + GN": ("paper/dipn+gn", "dipn+gn"),
+        "GN alone, never pushing": ("paper/gn", None),
+        "DQN + GN": ("paper/dqn+gn", "dqn+gn"),
+        "REA + DIPN": ("paper/rea+dipn", "rea+dipn"),
+        "VPG": ("paper/vpg", "vpg"),
+    }
+    for title, (ours, theirs) in rows.items():
+        cells = []
+        for key in ("completion", "grasp_success_all", "efficiency_all"):
+            cells.append(f"{100 * values[f'clear/hard/{ours}/{key}']:.1f}")
+            published = dict(zip(paper.COLUMNS, paper.TABLE["hard"][theirs], strict=True)) if theirs else {}
+            cells.append(f"{published[key]:.1f}" if theirs else "")
+        assert "| " + " | ".join([title, *cells]).replace("|  |", "| |") in text
+    aids = [values[f"clear/hard/unguarded/dipn+gn/{key}"] for key in ("grasp_success_all", "efficiency_all")]
+    said = "{:.1f} % grasp success and {:.1f} % efficiency".format(*(100 * aid for aid in aids))
+    assert said in " ".join(text.split())
+
+
+def test_the_licence_and_the_citation_are_there() -> None:
+    assert "Apache License" in (ROOT / "LICENSE").read_text()[:200]
+    assert "license: Apache-2.0" in (ROOT / "CITATION.cff").read_text()
+
+
+def prepare(folder: pathlib.Path, data: dict[str, pathlib.Path]) -> None:
+    """What the pages' Python reads: a data set, runs (the shipped networks), a case file."""
+    shutil.copytree(data["push"], folder / "data" / "push")
+    for run, network in (("dipn", "dipn"), ("gn", "grasp")):
+        shutil.copytree(ROOT / "dipn_jax" / "data" / network, folder / "runs" / run)
+    page = (ROOT / "docs" / "howto" / "your_cases.md").read_text()
+    cases = json.loads(re.search(r"^```json\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)[1])  # type: ignore[index]
+    (folder / "my_cases.json").write_text(json.dumps(cases))
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *HOWTO], ids=lambda page: page.name)
+def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    prepare(tmp_path, data)
+    with contextlib.chdir(tmp_path):
+        names = tutorial_pictures.run(page)
+    if page.name == "README.md":
+        decision, observation = names["decision"], names["observation"]
+        _, row, col = decision.grasp_pixel
+        assert not decision.is_push and decision.grasp_score > 0.9 and observation.label[row, col] >= 0
+    elif page.name == "sweep_distance.md":
+        travel = abs(names["motion"][0]).max((1, 2))
+        assert travel[0] < travel[4] < travel[9], "longer pushes move further"
+    elif page.name == "engines.md":
+        assert not names["rollout"].fault.any()
+    elif page.name == "your_cases.md":
+        assert names["names"] == ["two-cubes"] and names["observation"].slots == 2
+    elif page.name == "many_workers.md":
+        assert names["episodes"].poses.shape[:2] == (24, 11)
+
+
+@pytest.mark.slow
+def test_the_tutorial_clears_its_table(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "tutorial").mkdir()
+    with contextlib.chdir(tmp_path):
+        names = tutorial_pictures.run(ROOT / "docs" / "tutorial.md")
+    assert names["actions"][0] == "push" and names["actions"].count("grasp") == 4
+    made = {path.name for path in (tmp_path / "tutorial").iterdir()}
+    assert made == {path.name for path in (ROOT / "docs" / "tutorial").iterdir()}
+
+
+def smaller(words: list[str]) -> tuple[str, ...]:
+    """A command of the tutorial, made small."""
+    program, name, *rest = words
+    options = [SMALL.get(before, word) for before, word in zip(["", *rest], rest, strict=False)]
+    extra = ALWAYS[program] if name != "images" else ["--shard-size", "24"]
+    given = set(options)
+    for option, value in zip(extra[::2], extra[1::2], strict=True):
+        options += [] if option in given else [option, value]
+    if name == "clear" and "runs/dipn" in options:
+        options += ["--names", "06", "--candidates", "4"]
+    return (program, name, *options)
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_tutorial_work_at_small_scale(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for words in commands(ROOT / "docs" / "tutorial.md"):
+        if words[0] == "python":
+            moving_picture.main(pathlib.Path("results/picture"), pathlib.Path("results/clearing.gif"))
+        else:
+            program, *arguments = smaller(words)
+            known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
+            assert console.run(program, known, arguments) == 0, words
+    report = pathlib.Path("results/report/report.html")
+    assert report.exists() and pathlib.Path("results/clearing.gif").stat().st_size < 1.5e6
+    assert files.read_json(pathlib.Path("results/hard/metrics.json"))["instances"] == 1
