@@ -17,7 +17,8 @@ from benchmarks.datagen_mjx import engine as mjx_engine
 from benchmarks.datagen_mjx import heaps
 from benchmarks.datagen_native import ACTIONS
 from benchmarks.harness import Setting, Skipped, make_data, seconds
-from dipn_jax.engine import Engine, EngineName
+from dipn_jax.engine import Engine
+from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.warp import WarpEngine

@@ -17,8 +17,9 @@ from typing import Any
 import jax
 
 from dipn_jax import console, files, structs
-from dipn_jax.engine import Engine, EngineName
+from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
+from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine, resolve
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.storage import records, shards

@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from dipn_jax import structs
-from dipn_jax.engine import Engine, EngineName
+from dipn_jax.engine import Engine
+from dipn_jax.names import EngineName
 from dipn_jax.physics import native
 from dipn_jax.sight import render
 from dipn_jax.structs import Fault, Grasp, Push, SettledScene

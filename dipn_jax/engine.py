@@ -6,14 +6,11 @@ The engines themselves are in `dipn_jax.physics`; whoever simulates is handed on
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import Protocol
 
 from jaxtyping import Float
 
-if TYPE_CHECKING:  # the commands name an engine without importing JAX
-    from dipn_jax.structs import Array, Rollout, Scene, Trajectory
-
-EngineName = Literal["auto", "native", "mjx", "warp"]
+from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
 
 @dataclasses.dataclass(frozen=True)

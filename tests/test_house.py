@@ -24,7 +24,7 @@ MOST_LINES = 300
 """Of a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "files", "machine", "structs", "workspace", "geometry", "batching", "engine",
+    "errors", "names", "files", "machine", "structs", "workspace", "geometry", "batching", "engine",
     "world", "physics", "sight", "networks", "storage", "planning", "console",
 ]  # fmt: skip
 

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING, Any, Literal
 
 from dipn_jax import console
-from dipn_jax.engine import EngineName
+from dipn_jax.names import EngineName
 
 from .configs import BaselineConfig, OnlineConfig, Preset, ShapeClass, TrainConfig
 

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from dipn_jax.engine import Engine, EngineName, PhysicsConfig
+from dipn_jax.engine import Engine, PhysicsConfig
 from dipn_jax.errors import UserError
 from dipn_jax.machine import cores
+from dipn_jax.names import EngineName
 from dipn_jax.structs import Array
 
 CONTROL_PERIOD = 0.01

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int, Key
 
 from dipn_jax.errors import UserError
+from dipn_jax.names import MethodName
 from dipn_jax.networks import vpg
 from dipn_jax.planning import planner, predictors, scorers
-from dipn_jax.planning.names import MethodName
 from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Decision, Observation

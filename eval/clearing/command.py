@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from dipn_jax import console
-from dipn_jax.engine import Engine, EngineName
 from dipn_jax.errors import UserError
-from dipn_jax.planning.names import MethodName
+from dipn_jax.names import EngineName, MethodName
 
 from .. import options
 from .tables import DEFAULT_TABLES, Tables
 
 if TYPE_CHECKING:
+    from dipn_jax.engine import Engine
     from dipn_jax.planning.methods import PolicyConfig
 
     from .on_tables import TablePolicy

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import tyro
 
 from dipn_jax import console
-from dipn_jax.engine import EngineName
 from dipn_jax.errors import UserError
+from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
 from .. import options
