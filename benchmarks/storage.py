@@ -14,7 +14,7 @@ from dipn_jax.datagen.generate import Job, generate
 from benchmarks.harness import Setting, quiet
 from dipn_jax import structs
 from dipn_jax.sight import render
-from dipn_jax.storage import records
+from dipn_jax.storage import shards
 from dipn_jax.structs import Observation, PushEpisode
 from dipn_jax.world import scenes
 
@@ -56,6 +56,6 @@ def vs_images(setting: Setting) -> Iterator[tuple[str, float]]:
         with quiet():
             generate(job, folder)
         whole = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-        made = records.read_shard(records.shard_path(folder, 0), kind="push")
+        made = shards.read_shard(shards.shard_path(folder, 0), kind="push")
     made = jax.tree.map(np.asarray, made)
     yield "storage.vs_images", whole / episodes / image_bytes(made, setting.pick(20, 100))

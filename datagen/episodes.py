@@ -15,6 +15,7 @@ from dipn_jax.planning import candidates
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import render
 from dipn_jax.structs import (
+    Array,
     Fault,
     Grasp,
     GraspEpisode,
@@ -64,7 +65,7 @@ def push_batch(
     return _drop_unusable(episodes, counts, together=len(distances))
 
 
-def aim_pushes(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int) -> tuple[Push, jax.Array]:
+def aim_pushes(keys: jax.Array, scene: Scene, poses: Array, *, actions: int) -> tuple[Push, jax.Array]:
     """Draw 10 cm pushes `[B, actions]` on the visible objects of scenes `[B, N]` at `poses [B, N, 7]`.
 
     Returns:
@@ -122,7 +123,7 @@ def grasp_batch(
     return _drop_unusable(episodes, counts)
 
 
-def aim_grasps(keys: jax.Array, scene: Scene, poses: np.ndarray, *, actions: int, guide: Guide | None = None) -> Grasp:
+def aim_grasps(keys: jax.Array, scene: Scene, poses: Array, *, actions: int, guide: Guide | None = None) -> Grasp:
     """Draw grasps `[B, actions]` on the visible foreground of scenes `[B, N]` at `poses [B, N, 7]`."""
     return batching.in_batches(functools.partial(_aim_grasps, actions=actions, guide=guide), keys, scene, poses)
 

@@ -21,7 +21,7 @@ from dipn_jax.engine import Engine, EngineName
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine, resolve
 from dipn_jax.planning.planner import Scorer
-from dipn_jax.storage import records
+from dipn_jax.storage import records, shards
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 
@@ -175,7 +175,7 @@ def _write_all(
 
     def one(index: int) -> None:
         made, counts = shard(job, index, engine, tally, scorer)
-        records.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
+        shards.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
         records.update_manifest(out)
 
     with concurrent.futures.ThreadPoolExecutor(SHARDS_AT_ONCE) as pool:
@@ -193,8 +193,8 @@ def _write_all(
 
 def _written(out: pathlib.Path, index: int, job: Job) -> bool:
     """Return whether shard `index` is there with all its episodes; a shorter one is made anew."""
-    path = records.shard_path(out, index)
-    return path.exists() and records.count(path) == job.size(index)
+    path = shards.shard_path(out, index)
+    return path.exists() and shards.count(path) == job.size(index)
 
 
 def _claim(job: Job, out: pathlib.Path) -> None:

@@ -8,7 +8,7 @@ import scipy.spatial
 from dipn_jax import geometry, structs
 from dipn_jax.engine import Engine
 from dipn_jax.sight import fingers
-from dipn_jax.structs import Fault, Grasp, Scene
+from dipn_jax.structs import Array, Fault, Grasp, Scene
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import primitives, scenes, shapes
 
@@ -75,7 +75,7 @@ def _set_down(rng: np.random.Generator, scene: Scene, quat: np.ndarray) -> np.nd
     return poses.astype(np.float32)
 
 
-def stable_faces(shape: int, size: np.ndarray) -> np.ndarray:
+def stable_faces(shape: int, size: Array) -> np.ndarray:
     """Return orientations `[F, 4]` (wxyz) that lay an object on each face of its hull that it can stand on.
 
     Args:
@@ -105,14 +105,14 @@ def _turn_down(normal: np.ndarray) -> np.ndarray:
     return quat / np.linalg.norm(quat) if quat[0] > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
-def _corners(shape: int, size: np.ndarray, pose: np.ndarray) -> list[np.ndarray]:
+def _corners(shape: int, size: Array, pose: np.ndarray) -> list[np.ndarray]:
     """Return the corners `[M, 3]` of each part of an object in the workspace."""
     turn = np.asarray(geometry.quat_to_matrix(pose[3:]))
     parts = shapes.UNIT_VERTICES[shape][shapes.CORNERS_USED[shape] > 0]
     return [(part * size) @ turn.T + pose[:3] for part in parts]
 
 
-def _directions(shape: int, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def _directions(shape: int, size: Array, pose: np.ndarray) -> np.ndarray:
     """Return the angles `[K]` of the normals of upright faces."""
     hull = shapes.hull(shape, size)
     normals = np.asarray(hull.normals)[np.asarray(hull.alive)].reshape(-1, 3)
@@ -121,7 +121,7 @@ def _directions(shape: int, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return np.unique(np.arctan2(normals[upright, 1], normals[upright, 0]).round(3) % np.pi)
 
 
-def antipodal(shape: int, size: np.ndarray, pose: np.ndarray) -> Grasp | None:
+def antipodal(shape: int, size: Array, pose: np.ndarray) -> Grasp | None:
     """Return the narrowest grasp of two upright, opposite faces of one part; None if all are wider than WIDEST_OBJECT.
 
     Args:
@@ -145,7 +145,7 @@ def antipodal(shape: int, size: np.ndarray, pose: np.ndarray) -> Grasp | None:
             left[1] = max(left[1], tip)
             if (right - left > LEAST_OVERLAP).all():
                 middle = axis * (low + high) / 2 + side * (left[0] + right[0]) / 2
-                found.append((round(high - low, 4), -np.prod(right - left), Grasp(middle, angle, tip)))
+                found.append((round(high - low, 4), -np.prod(right - left), Grasp(middle, angle, np.asarray(tip))))
     return min(found, key=lambda entry: entry[:2])[2] if found else None
 
 

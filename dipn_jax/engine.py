@@ -8,6 +8,8 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Literal, Protocol
 
+from jaxtyping import Float
+
 if TYPE_CHECKING:  # the commands name an engine without importing JAX
     from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
@@ -49,9 +51,9 @@ class Engine(Protocol):
     def simulate(
         self,
         scenes: Scene,
-        poses: Array,
+        poses: Float[Array, "B N 7"],
         trajectories: Trajectory,
-        samples: Array,
+        samples: Float[Array, " S"],
         *,
         settle: bool = False,
         fence: float = 0.0,
@@ -59,15 +61,15 @@ class Engine(Protocol):
         """Follow `trajectories` from rest.
 
         Args:
-          scenes: `[B, N, ...]`.
-          poses: `[B, N, 7]` initial poses; velocities are zero.
-          trajectories: `time [B, K]`, `target [B, K, 5]`; the gripper starts at the first key frame.
-          samples: `[S]` seconds, increasing, common to the batch; the simulation ends at the last.
+          scenes: B scenes.
+          poses: initial poses (metres, quaternions wxyz, workspace); velocities are zero.
+          trajectories: one a scene; the gripper starts at the first key frame.
+          samples: seconds, increasing, common to the batch; the simulation ends at the last.
           settle: flag episodes in which something still moves at the end.
           fence: seconds from the start for which objects are kept near the workspace's centre (`fence_force`).
 
         Returns:
-          Rollout with a leading `[B]`; what went wrong is in `fault [B]`.
+          Rollout with a leading `[B]`; what went wrong is in `fault`.
 
         Raises:
           Stopped: `stop` was called.

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Key, Num, Shaped
 
 from dipn_jax.structs import Array
 from dipn_jax.workspace import WORKSPACE
 
 
-def quat_to_matrix(quat: Array) -> Array:
-    """Rotation matrix `[..., 3, 3]` of a unit quaternion `[..., 4]` (wxyz)."""
+def quat_to_matrix(quat: Float[Array, "*b 4"]) -> Float[jax.Array, "*b 3 3"]:
+    """Rotation matrix of a unit quaternion (wxyz)."""
     w, x, y, z = jnp.moveaxis(quat, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -20,8 +21,8 @@ def quat_to_matrix(quat: Array) -> Array:
     return jnp.stack([jnp.stack(r, -1) for r in rows], -2)
 
 
-def quat_multiply(a: Array, b: Array) -> Array:
-    """Hamilton product of quaternions `[..., 4]` (wxyz): rotate by `b`, then by `a`."""
+def quat_multiply(a: Float[Array, "*#b 4"], b: Float[Array, "*#b 4"]) -> Float[jax.Array, "*b 4"]:
+    """Hamilton product of quaternions (wxyz): rotate by `b`, then by `a`."""
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
     bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
     return jnp.stack(
@@ -35,50 +36,52 @@ def quat_multiply(a: Array, b: Array) -> Array:
     )
 
 
-def quat_about_z(angle: Array) -> Array:
-    """Quaternion `[..., 4]` (wxyz) of a rotation by `angle [...]` radians about z."""
+def quat_about_z(angle: Float[Array, "*b"] | float) -> Float[jax.Array, "*b 4"]:
+    """Quaternion (wxyz) of a rotation by `angle` radians about z."""
     half = jnp.asarray(angle) / 2
     zero = jnp.zeros_like(half)
     return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], -1)
 
 
-def random_quat(key: Array, *, shape: tuple[int, ...] = ()) -> Array:
-    """Uniformly random rotations `[*shape, 4]` (wxyz)."""
+def random_quat(key: Key[Array, ""], *, shape: tuple[int, ...] = ()) -> Float[jax.Array, "*shape 4"]:
+    """Uniformly random rotations (wxyz)."""
     q = jax.random.normal(key, (*shape, 4))
     return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
 
 
-def wrap_angle(angle: Array) -> Array:
-    """The same angle in [-pi, pi)."""
+def wrap_angle(angle: Float[Array, "*b"]) -> Float[jax.Array, "*b"]:
+    """The same angle (radians) in [-pi, pi)."""
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 
-def rotate2d(xy: Array, angle: Array) -> Array:
-    """Points `[..., 2]` rotated by `angle [...]` radians about the origin."""
+def rotate2d(xy: Num[Array, "*#b 2"], angle: Float[Array, "*#b"] | float) -> Float[jax.Array, "*b 2"]:
+    """Points rotated by `angle` radians about the origin."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     x, y = xy[..., 0], xy[..., 1]
     return jnp.stack([c * x - s * y, s * x + c * y], -1)
 
 
-def metres_to_pixels(xy: Array) -> Array:
-    """Workspace metres `[..., 2]` (x, y) to fractional pixels `[..., 2]` (col, row); centres are integers."""
+def metres_to_pixels(xy: Float[Array, "*b 2"]) -> Float[Array, "*b 2"]:
+    """Workspace metres (x, y) to fractional pixels (col, row); centres are integers."""
     return (xy + WORKSPACE.half) / WORKSPACE.pixel - 0.5
 
 
-def pixels_to_metres(pixels: Array) -> Array:
+def pixels_to_metres(pixels: Num[Array, "*b 2"]) -> Float[jax.Array, "*b 2"]:
     """Inverse of `metres_to_pixels`."""
     return (jnp.asarray(pixels, jnp.float32) + 0.5) * WORKSPACE.pixel - WORKSPACE.half
 
 
-def transform_poses(poses: Array, angle: Array, shift: Array) -> Array:
-    """Poses `[N, 7]` rotated by `angle []` about the workspace's origin, then shifted by `shift [2]` metres."""
+def transform_poses(
+    poses: Float[Array, "N 7"], angle: Float[Array, ""] | float, shift: Float[Array, " 2"]
+) -> Float[jax.Array, "N 7"]:
+    """Poses rotated by `angle` radians about the workspace's origin, then shifted by `shift` metres."""
     xy = rotate2d(poses[..., :2], angle) + shift
     quat = quat_multiply(quat_about_z(angle), poses[..., 3:])
     return jnp.concatenate([xy, poses[..., 2:3], quat], -1)
 
 
-def planar_angle(before: Array, after: Array) -> Array:
-    """The rotation about z `[...]` (radians) nearest to the turn between two quaternions `[..., 4]`.
+def planar_angle(before: Float[Array, "*#b 4"], after: Float[Array, "*#b 4"]) -> Float[jax.Array, "*b"]:
+    """The rotation about z (radians) nearest to the turn between two quaternions (wxyz).
 
     It maximizes the trace of Rz(angle)^T R, with R the turn as a matrix: exact for a turn about z.
     """
@@ -89,13 +92,15 @@ def planar_angle(before: Array, after: Array) -> Array:
     return jnp.arctan2(4 * w * z, 2 * (w * w - z * z) + 1e-12)
 
 
-def planar_motion(before: Array, after: Array, center: Array) -> Array:
-    """Motion `[N, 3]` (dx, dy metres, dtheta radians) of a planar body between two poses `[N, 7]`.
+def planar_motion(
+    before: Float[Array, "*#b 7"], after: Float[Array, "*#b 7"], center: Float[Array, "*#b 2"]
+) -> Float[jax.Array, "*b 3"]:
+    """Motion (dx, dy metres, dtheta radians) of a planar body between two poses.
 
     Args:
       before: poses before.
       after: poses after.
-      center: `[N, 2]` metres, the point of the body that (dx, dy) is the displacement of.
+      center: metres, the point of the body that (dx, dy) is the displacement of.
     """
     angle = planar_angle(before[..., 3:], after[..., 3:])
     arm = rotate2d(center - before[..., :2], angle)
@@ -103,14 +108,16 @@ def planar_motion(before: Array, after: Array, center: Array) -> Array:
     return jnp.concatenate([shift, angle[..., None]], -1)
 
 
-def view_grid(height: int, width: int) -> Array:
-    """Pixel centres `[height, width, 2]` as (col, row)."""
+def view_grid(height: int, width: int) -> Float[jax.Array, "{height} {width} 2"]:
+    """Pixel centres as (col, row)."""
     rows, cols = jnp.meshgrid(jnp.arange(height), jnp.arange(width), indexing="ij")
     return jnp.stack([cols, rows], -1).astype(jnp.float32)
 
 
-def sample_nearest(image: Array, pixels: Array, fill: float | int = 0) -> Array:
-    """`image [H, W, ...]` at fractional `pixels [..., 2]` (col, row), nearest; `fill` outside."""
+def sample_nearest(
+    image: Shaped[Array, "H W *c"], pixels: Float[Array, "*b 2"], fill: float | int = 0
+) -> Shaped[jax.Array, "*any"]:
+    """`image` at fractional `pixels` (col, row), nearest, `[*b, *c]`; `fill` outside."""
     h, w = image.shape[:2]
     at = jnp.round(pixels).astype(jnp.int32)
     col, row = at[..., 0], at[..., 1]
@@ -120,17 +127,19 @@ def sample_nearest(image: Array, pixels: Array, fill: float | int = 0) -> Array:
     return jnp.where(inside.reshape(inside.shape + (1,) * (value.ndim - inside.ndim)), value, fill)
 
 
-def rotate_map(image: Array, angle: Array, size: int, fill: float | int = 0) -> Array:
+def rotate_map(
+    image: Shaped[Array, "H W *c"], angle: Float[Array, ""] | float, size: int, fill: float | int = 0
+) -> Shaped[jax.Array, "{size} {size} *c"]:
     """A map turned about its centre by `-angle`, so that direction `angle` becomes the columns' (+x).
 
     Args:
-      image: `[H, W, ...]`.
-      angle: `[]` radians.
+      image: a map, or several in its last axes.
+      angle: radians.
       size: side of the result in pixels.
       fill: value outside.
 
     Returns:
-      `[size, size, ...]`, nearest neighbour.
+      The turned map, nearest neighbour.
     """
     h, w = image.shape[:2]
     middle = jnp.array([(w - 1) / 2, (h - 1) / 2])
@@ -138,6 +147,8 @@ def rotate_map(image: Array, angle: Array, size: int, fill: float | int = 0) -> 
     return sample_nearest(image, rotate2d(out, angle) + middle, fill)
 
 
-def unrotate_map(image: Array, angle: Array, size: int, fill: float | int = 0) -> Array:
-    """Inverse of `rotate_map`: `[H, W, ...]` back to `[size, size, ...]`."""
+def unrotate_map(
+    image: Shaped[Array, "H W *c"], angle: Float[Array, ""] | float, size: int, fill: float | int = 0
+) -> Shaped[jax.Array, "{size} {size} *c"]:
+    """Inverse of `rotate_map`."""
     return rotate_map(image, -angle, size, fill)

@@ -1,8 +1,8 @@
 """The types that cross the rooms of the project.
 
-Every field states its shape, unit and frame *without* the batch axis; a leading `[B]` is added by
-`jax.vmap` or by the caller. `N` is the padded number of object slots, `P` a number of pushes, `S` a
-number of sampled instants.
+Every field states its shape in its annotation (tests check it, see CONTRIBUTING.md), its unit and frame beside it. `*b`
+stands for any leading batch axes, added by `jax.vmap` or by the caller; they are the same for all fields of one struct.
+`N` is the padded number of object slots, `P` a number of pushes, `S` a number of sampled instants.
 
 Workspace frame: origin at the centre of the workspace on the table's surface, z up, angles from +x
 toward +y. Maps are indexed `[row, col]`, row along +y and col along +x.
@@ -10,21 +10,29 @@ toward +y. Maps are indexed `[row, col]`, row along +y and col along +x.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, TypeAlias
+import enum
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import flax.struct
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
-Array: TypeAlias = Any
+if TYPE_CHECKING:
+    Array: TypeAlias = jax.Array | np.ndarray
+else:
+    Array = jax.Array | np.ndarray | np.generic  # an entry of an np.ndarray is an np.generic
 """A jax.Array on the device, an np.ndarray on the host: every type below serves both."""
 
 ABSENT = -1
 """Value of `Scene.shape` in an empty slot."""
 
 
-class Fault:
-    """Bits of a fault code: failure inside a simulation is data, not an exception."""
+class Fault(enum.IntFlag):
+    """Bits of a fault code: failure inside a simulation is data, not an exception.
+
+    A member is an `int`; only NumPy takes it for an int64, where it takes a plain 1 for what the array beside it is.
+    """
 
     NON_FINITE = 1  # a position or velocity became inf or NaN
     CAPACITY = 2  # the engine ran out of room for contacts or geom pairs
@@ -38,25 +46,28 @@ class Fault:
     UNUSABLE = NON_FINITE | CAPACITY | SPEED | PENETRATION
     """The simulation went wrong; the other faults are physics (a roll, an object off the table) or the gripper's."""
 
-    NAMES: ClassVar[dict[int, str]] = {
-        1: "non_finite",
-        2: "capacity",
-        4: "unsettled",
-        8: "outside",
-        16: "speed",
-        32: "penetration",
-        64: "gripper_short",
-        128: "tipped",
-    }
+    NAMES = enum.nonmember(
+        {
+            1: "non_finite",
+            2: "capacity",
+            4: "unsettled",
+            8: "outside",
+            16: "speed",
+            32: "penetration",
+            64: "gripper_short",
+            128: "tipped",
+        }
+    )
+    """What each bit is called in metrics and logs."""
 
     @classmethod
-    def usable(cls, codes: Array) -> np.ndarray:
-        """Which of the simulations with `codes [...]` can be believed."""
+    def usable(cls, codes: Int[Array, "*any"]) -> Bool[np.ndarray, "*any"]:
+        """Which of the simulations with these fault codes can be believed."""
         return (np.asarray(codes) & cls.UNUSABLE) == 0
 
     @classmethod
-    def count(cls, codes: Array) -> dict[str, int]:
-        """How many of `codes [B]` carry each named fault."""
+    def count(cls, codes: Int[Array, "*any"]) -> dict[str, int]:
+        """How many of the fault codes carry each named fault."""
         flat = np.asarray(codes).reshape(-1)
         return {name: int(((flat & bit) != 0).sum()) for bit, name in cls.NAMES.items()}
 
@@ -81,11 +92,11 @@ class Scene(Pytree):
     scenes[0].replace(friction=np.full(6, 0.2))
     """
 
-    shape: Array  # [N] int32: index into shapes.CLASSES, ABSENT where the slot is empty
-    size: Array  # [N, 3] metres: bounding box along the object's own axes
-    color: Array  # [N, 3] in [0, 1]: RGB
-    mass: Array  # [N] kg
-    friction: Array  # [N] sliding coefficient between the object and the table
+    shape: Int[Array, "*b N"]  # index into shapes.CLASSES, ABSENT where the slot is empty
+    size: Float[Array, "*b N 3"]  # metres: bounding box along the object's own axes
+    color: Float[Array, "*b N 3"]  # in [0, 1]: RGB
+    mass: Float[Array, "*b N"]  # kg
+    friction: Float[Array, "*b N"]  # sliding coefficient between the object and the table
 
 
 @flax.struct.dataclass
@@ -95,9 +106,9 @@ class Observation(Pytree):
     observation = dipn_jax.Observation(height, color, label, slots=10)
     """
 
-    height: Array  # [H, W] metres above the table
-    color: Array  # [H, W, 3] in [0, 1]
-    label: Array  # [H, W] int32: object slot, ABSENT on the table
+    height: Float[Array, "*b H W"]  # metres above the table
+    color: Float[Array, "*b H W 3"]  # in [0, 1]
+    label: Int[Array, "*b H W"]  # object slot, ABSENT on the table
     slots: int = flax.struct.field(pytree_node=False)  # N: labels are below; static, as it shapes programs
 
 
@@ -108,9 +119,9 @@ class Push(Pytree):
     push = dipn_jax.Push(start=np.array([-0.1, 0.0]), angle=np.float32(0.0), distance=np.float32(0.1))
     """
 
-    start: Array  # [2] metres, workspace: where the gripper comes down
-    angle: Array  # [] radians: direction of travel
-    distance: Array  # [] metres
+    start: Float[Array, "*b 2"]  # metres, workspace: where the gripper comes down
+    angle: Float[Array, "*b"]  # radians: direction of travel
+    distance: Float[Array, "*b"]  # metres
 
 
 @flax.struct.dataclass
@@ -120,34 +131,34 @@ class Grasp(Pytree):
     grasp = dipn_jax.Grasp(center=np.array([0.0, 0.05]), angle=np.float32(0.0), height=np.float32(0.02))
     """
 
-    center: Array  # [2] metres, workspace: midpoint between the fingers
-    angle: Array  # [] radians: direction of the closing axis
-    height: Array  # [] metres: fingertips above the table
+    center: Float[Array, "*b 2"]  # metres, workspace: midpoint between the fingers
+    angle: Float[Array, "*b"]  # radians: direction of the closing axis
+    height: Float[Array, "*b"]  # metres: fingertips above the table
 
 
 @flax.struct.dataclass
 class Trajectory(Pytree):
     """Gripper set points, linear between `K` key frames."""
 
-    time: Array  # [K] seconds, increasing
-    target: Array  # [K, 5]: x, y, tip height (metres), yaw of the closing axis (radians), inner gap (metres)
+    time: Float[Array, "*b K"]  # seconds, increasing
+    target: Float[Array, "*b K 5"]  # x, y, tip height (metres), yaw of the closing axis (radians), inner gap (metres)
 
 
 @flax.struct.dataclass
 class Rollout(Pytree):
     """What a simulation returns."""
 
-    poses: Array  # [S, N, 7]: position (metres) and quaternion wxyz, workspace
-    gripper: Array  # [S, 5]: as Trajectory.target, as reached
-    fault: Array  # [] int32: bits of Fault
+    poses: Float[Array, "*b S N 7"]  # position (metres) and quaternion wxyz, workspace
+    gripper: Float[Array, "*b S 5"]  # as Trajectory.target, as reached
+    fault: Int[Array, "*b"]  # bits of Fault
 
 
 @flax.struct.dataclass
 class Outcome(Pytree):
     """Result of a grasp."""
 
-    held: Array  # [N] bool: objects in the hand after the lift
-    success: Array  # [] bool: at least one
+    held: Bool[Array, "*b N"]  # objects in the hand after the lift
+    success: Bool[Array, "*b"]  # at least one
 
 
 @flax.struct.dataclass
@@ -155,10 +166,10 @@ class PushEpisode(Pytree):
     """One push: everything needed to render it, before, during and after."""
 
     scene: Scene
-    poses: Array  # [11, N, 7]: at 0, 1, ..., 10 cm of travel; past `push.distance`, as often (every 0.1 s)
-    after: Array  # [N, 7]: at rest, the gripper gone
+    poses: Float[Array, "*b 11 N 7"]  # at 0, 1, ..., 10 cm of travel; past `push.distance`, as often (every 0.1 s)
+    after: Float[Array, "*b N 7"]  # at rest, the gripper gone
     push: Push
-    fault: Array  # [] int32
+    fault: Int[Array, "*b"]  # bits of Fault
 
 
 @flax.struct.dataclass
@@ -166,12 +177,12 @@ class GraspEpisode(Pytree):
     """One grasp and whether it held."""
 
     scene: Scene
-    poses: Array  # [N, 7] before
-    after: Array  # [N, 7] after the lift
+    poses: Float[Array, "*b N 7"]  # before
+    after: Float[Array, "*b N 7"]  # after the lift
     grasp: Grasp
-    held: Array  # [N] bool
-    success: Array  # [] bool
-    fault: Array  # [] int32
+    held: Bool[Array, "*b N"]  # objects in the hand after the lift
+    success: Bool[Array, "*b"]  # at least one
+    fault: Int[Array, "*b"]  # bits of Fault
 
 
 @flax.struct.dataclass
@@ -179,8 +190,8 @@ class SettledScene(Pytree):
     """A scene at rest; the data set of images is made of these."""
 
     scene: Scene
-    poses: Array  # [N, 7]
-    fault: Array  # [] int32
+    poses: Float[Array, "*b N 7"]  # position (metres) and quaternion wxyz, workspace
+    fault: Int[Array, "*b"]  # bits of Fault
 
 
 @flax.struct.dataclass
@@ -188,11 +199,11 @@ class Candidates(Pytree):
     """What there is to choose from on one table: the best grasp, and pushes."""
 
     pushes: Push  # [P]
-    feasible: Array  # [P] bool
-    grasp_pixel: Array  # [3] int32: rotation, row, col of the best grasp
-    grasp_score: Array  # [] score of that grasp in [0, 1]
-    value_now: Array  # [] mean score of all grasps
-    grasp_now: Array  # [] bool: the best grasp is to be taken, whatever pushes promise
+    feasible: Bool[Array, "*b P"]
+    grasp_pixel: Int[Array, "*b 3"]  # rotation, row, col of the best grasp
+    grasp_score: Float[Array, "*b"]  # score of that grasp in [0, 1]
+    value_now: Float[Array, "*b"]  # mean score of all grasps
+    grasp_now: Bool[Array, "*b"]  # the best grasp is to be taken, whatever pushes promise
 
 
 @flax.struct.dataclass
@@ -203,21 +214,21 @@ class Decision(Pytree):
     action = decision.push if decision.is_push else decision.grasp
     """
 
-    is_push: Array  # [] bool
+    is_push: Bool[Array, "*b"]
     push: Push  # the best one
     grasp: Grasp  # the best one
-    grasp_pixel: Array  # [3] int32: rotation, row, col of it
-    grasp_score: Array  # [] score of it in [0, 1], or its value
-    value_now: Array  # [] mean score of all grasps now (of the cautious ones if no push was allowed)
-    value_push: Array  # [] gamma times the mean score after the best push; -inf if none is feasible
-    motion: Array  # [N, 3] predicted dx, dy (metres), dtheta (radians) for the best push
-    best: Array | None = None  # [] int32 index of the best push among the candidates
-    values: Array | None = None  # [P] gamma times the mean score after each candidate; -inf where not feasible
+    grasp_pixel: Int[Array, "*b 3"]  # rotation, row, col of it
+    grasp_score: Float[Array, "*b"]  # score of it in [0, 1], or its value
+    value_now: Float[Array, "*b"]  # mean score of all grasps now (of the cautious ones if no push was allowed)
+    value_push: Float[Array, "*b"]  # gamma times the mean score after the best push; -inf if none is feasible
+    motion: Float[Array, "*b N 3"]  # predicted dx, dy (metres), dtheta (radians) for the best push
+    best: Int[Array, "*b"] | None = None  # index of the best push among the candidates
+    values: Float[Array, "*b P"] | None = None  # gamma times the mean score after each candidate; -inf: not feasible
     candidates: Candidates | None = None
-    predicted: Array | None = None  # [H, W, 4] predicted RGB and height after the best push
+    predicted: Float[Array, "*b H W 4"] | None = None  # predicted RGB and height after the best push
 
     def brief(self) -> Decision:
-        """The decision without candidates and images: what is kept of many tables."""
+        """Return the decision without candidates and images: what is kept of many tables."""
         brief: Decision = self.replace(best=None, values=None, candidates=None, predicted=None)
         return brief
 
@@ -240,7 +251,7 @@ def stack(items: list[Any]) -> Any:
 def cast(items: Any) -> Any:
     """The same with every floating-point leaf as float32, as numpy."""
 
-    def one(leaf: Array) -> np.ndarray:
+    def one(leaf: Any) -> np.ndarray:
         array = np.asarray(leaf)
         return array.astype(np.float32) if array.dtype.kind == "f" else array
 

@@ -92,8 +92,8 @@ def scene_at(shown: film.Film, step: int) -> Scene:
 def trajectory(shown: film.Film, step: int) -> Trajectory:
     """The gripper's set points `[1, K]` of action `step`."""
     if shown.what[step] == "push":
-        x, y, angle, distance = (np.float32(value) for value in shown.push[step])
-        return primitives.push_trajectory(structs.stack([Push(np.array([x, y]), angle, distance)]))
+        push = shown.push[step : step + 1]
+        return primitives.push_trajectory(Push(push[:, :2], push[:, 2], push[:, 3]))
     height = render.render(scene_at(shown, step), shown.poses[step]).height
     grasp = candidates.grasp_at(shown.grasp[step], height)
     return primitives.grasp_trajectory(jax.tree.map(lambda leaf: np.asarray(leaf)[None], grasp))

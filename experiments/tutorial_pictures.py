@@ -1,4 +1,4 @@
-"""The pictures of docs/tutorial.md, made by running that page's Python: `python -m experiments.tutorial_pictures`."""
+"""Make the pictures of docs/tutorial.md with the code that stands on that page."""
 
 from __future__ import annotations
 

@@ -8,6 +8,10 @@ from typing import Any
 
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as `console` sets it for the commands: JAX reads it when it is imported
 
+from jaxtyping import install_import_hook
+
+install_import_hook("dipn_jax", "shape_checks.check")  # before anything of the library is imported
+
 import jax
 import numpy as np
 import pytest

@@ -15,7 +15,7 @@ from flax import nnx
 
 from dipn_jax import console
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.storage import checkpoint, records
+from dipn_jax.storage import checkpoint, shards
 
 COMMANDS = {"datagen": datagen_cli.COMMANDS, "train": train_cli.COMMANDS, "eval": eval_cli.COMMANDS}
 
@@ -76,7 +76,7 @@ def test_a_missing_folder(call, tmp_path: pathlib.Path) -> None:
 
 def test_a_truncated_shard(call, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
     copy = pathlib.Path(shutil.copytree(data["push"], tmp_path / "push"))
-    path = records.shard_path(copy, 0)
+    path = shards.shard_path(copy, 0)
     path.write_bytes(path.read_bytes()[:1000])
     _one_line(call("datagen", "verify", copy), "shard-00000.parquet")
     _one_line(call("train", "push", "--data", copy, "--out", tmp_path / "r"), "repair")

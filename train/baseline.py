@@ -24,7 +24,7 @@ from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.storage import checkpoint
-from dipn_jax.structs import Array, Grasp, GraspEpisode
+from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
 
 from . import acting, tables
@@ -51,7 +51,9 @@ class State:
     moments: Any
     tables: tables.Tables
     then: Look | None = None  # of the tables after their last action, by the weights of that time
-    anew: Array = None  # [T] bool: tables that were replaced since
+    anew: np.ndarray = dataclasses.field(
+        default_factory=lambda: np.ones(0, bool)
+    )  # [T]: tables that were replaced since
     round: int = 0
     seen: dict[str, list[Window]] = dataclasses.field(default_factory=lambda: {"push": [], "grasp": []})
     did: list[tuple[str, float]] = dataclasses.field(default_factory=list)  # primitive and reward of each action

@@ -33,7 +33,7 @@ TABLE_WEIGHT = 0.05
 """Weight of a table pixel beside a foreground pixel: most of an image is table."""
 
 
-def turned_view(scene: Scene, poses: jax.Array, center: jax.Array, angle: jax.Array, *, pixels: int) -> Observation:
+def turned_view(scene: Scene, poses: Array, center: Array, angle: Array, *, pixels: int) -> Observation:
     """Return the observation of a view centred on `center [2]` (metres) with its columns along `angle []`."""
     shift = -geometry.rotate2d(center, -angle)
     return render.render(scene, geometry.transform_poses(poses, -angle, shift), pixels=pixels)
@@ -75,7 +75,7 @@ class PretrainTask:
             center = jax.random.uniform(shift_key, (2,), minval=-0.08, maxval=0.08)
             seen = turned_view(scene, poses, center, angle, pixels=PRETRAIN_VIEW)
             weight = jnp.where(seen.label >= 0, 1.0, TABLE_WEIGHT)
-            return render.rgbd(seen), fingers.geometric_labels(seen.height), weight
+            return render.rgbd(seen), fingers.geometric_labels(jnp.asarray(seen.height)), weight
 
         return jax.lax.map(one, (settled.scene, settled.poses, jax.random.split(key, settled.fault.shape[0])))
 

@@ -138,7 +138,7 @@ class PushTask:
             taught = jnp.take_along_axis(taught, drawn[:, None], 2)
         flipped = jax.random.bernoulli(mirror_key, 0.5, (count,))
 
-        def pick(mirrored: jax.Array, seen: jax.Array) -> jax.Array:
+        def pick(mirrored: Array, seen: Array) -> jax.Array:
             return jnp.where(flipped.reshape(-1, *[1] * (seen.ndim - 1)), mirrored, seen)
 
         inputs = jax.tree.map(pick, push_frame.mirror(inputs), inputs)

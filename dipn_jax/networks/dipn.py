@@ -7,10 +7,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jaxtyping import Bool, Float
 
 from dipn_jax.errors import UserError
 from dipn_jax.networks import push_frame, resnet, stepwise
 from dipn_jax.networks.push_frame import PushInput, View
+from dipn_jax.structs import Array
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 
 EXTRA_CENTIMETRES = 2
@@ -51,18 +53,24 @@ class _Paper(nnx.Module):
         self.pair = resnet.MLP(16 + 2 * 80, (128, 128, 128), rngs)
         self.motion = resnet.MLP(512 + 128, (256, 64, 32, 16, 3), rngs, linear_end=True)
 
-    def __call__(self, inputs: PushInput, distances: jax.Array) -> jax.Array:
+    def __call__(self, inputs: PushInput, distances: Float[Array, "B K"]) -> Float[jax.Array, "B N K 3"]:
         b, n = inputs.present.shape
         e_scene = self.scene_out(self.scene(_maps(inputs))[-1].mean((1, 2)))
-        crops = inputs.crops.reshape(b * n, *inputs.crops.shape[2:])
-        e_crop = self.item_out(self.item(crops, inputs.present.reshape(-1))[-1].mean((1, 2)))
-        where = self.center(inputs.centers / (WORKSPACE.half / 2))
+        crops, present = jnp.asarray(inputs.crops), jnp.asarray(inputs.present)
+        e_crop = self.item_out(self.item(crops.reshape(b * n, *crops.shape[2:]), present.reshape(-1))[-1].mean((1, 2)))
+        where = self.center(jnp.asarray(inputs.centers) / (WORKSPACE.half / 2))
         e_item = jnp.concatenate([e_crop.reshape(b, n, -1), where], -1)
-        each = [self._interact(push_frame.push_ends(d), e_item, e_scene, inputs.present) for d in distances.T]
+        each = [self._interact(push_frame.push_ends(d), e_item, e_scene, present) for d in distances.T]
         return jnp.stack(each, 2)
 
-    def _interact(self, ends: jax.Array, e_item: jax.Array, e_scene: jax.Array, present: jax.Array) -> jax.Array:
-        """Return motions `[B, N, 3]` by the pushes `ends [B, 4]`."""
+    def _interact(
+        self,
+        ends: Float[jax.Array, "B 4"],
+        e_item: Float[Array, "B N F"],
+        e_scene: Float[Array, "B G"],
+        present: Bool[Array, "B N"],
+    ) -> Float[jax.Array, "B N 3"]:
+        """Return motions by the pushes `ends`."""
         b, n, _ = e_item.shape
         e_push = self.push(ends)
         push = jnp.broadcast_to(e_push[:, None], (b, n, e_push.shape[-1]))
@@ -79,28 +87,28 @@ class _Compact(nnx.Module):
     def __init__(self, config: DipnConfig, rngs: nnx.Rngs) -> None:
         self.steps = stepwise.Stepwise(config.view, config.width, config.features, config.rounds, rngs)
 
-    def __call__(self, inputs: PushInput, distances: jax.Array) -> jax.Array:
+    def __call__(self, inputs: PushInput, distances: Float[Array, "B K"]) -> Float[jax.Array, "B N K 3"]:
         return _along(self.steps(inputs), distances)
 
 
-def _maps(inputs: PushInput) -> jax.Array:
+def _maps(inputs: PushInput) -> Float[jax.Array, "B M M 2"]:
     """Return the maps of the push and of the scene as an image of two channels."""
     return jnp.stack([inputs.push_map, inputs.scene_map], -1)
 
 
-def _pairs(items: jax.Array) -> list[jax.Array]:
-    """Return `items [B, N, F]` as the first and as the second of every pair, `[B, N, N, F]` each."""
+def _pairs(items: Float[Array, "B N F"]) -> list[Float[jax.Array, "B N N F"]]:
+    """Return `items` as the first and as the second of every pair."""
     n = items.shape[1]
     return [jnp.repeat(items[:, :, None], n, 2), jnp.repeat(items[:, None], n, 1)]
 
 
-def _others(present: jax.Array) -> jax.Array:
-    """Return whether the second object of a pair is `present [B, N]` and not the first, `[B, N, N, 1]` bool."""
+def _others(present: Bool[Array, "B N"]) -> Bool[Array, "B N N 1"]:
+    """Return whether the second object of a pair is `present` and not the first."""
     return present[:, None, :, None] & ~jnp.eye(present.shape[1], dtype=bool)[None, :, :, None]
 
 
-def _along(course: jax.Array, distances: jax.Array) -> jax.Array:
-    """Return motions `[B, N, K, 3]` after `distances [B, K]` (metres) of courses `[B, N, PUSH_STEPS, 3]`.
+def _along(course: Float[Array, "B N T 3"], distances: Float[Array, "B K"]) -> Float[jax.Array, "B N K 3"]:
+    """Return motions after `distances` (metres) of courses that are known after each of PUSH_STEPS centimetres.
 
     Beyond the last recorded centimetre objects continue as they moved in it.
     """
@@ -121,21 +129,21 @@ class DIPN(nnx.Module):
         self.config = config
         self.body = (_Paper if config.preset == "paper" else _Compact)(config, rngs)
 
-    def __call__(self, inputs: PushInput, distances: jax.Array) -> jax.Array:
+    def __call__(self, inputs: PushInput, distances: Float[Array, "B K"]) -> Float[jax.Array, "B N K 3"]:
         """Return the motions of every object after each of several distances of the same push.
 
         Args:
-          inputs: batched, `[B, ...]`.
-          distances: `[B, K]` metres, traced. `paper` was published for one distance; here the end of the push tells it
-            the distance.
+          inputs: batched.
+          distances: metres, traced. `paper` was published for one distance; here the end of the push tells it the
+            distance.
 
         Returns:
-          `[B, N, K, 3]`: dx, dy in pixels and dtheta in degrees, push frame; 0 for objects out of sight.
+          dx, dy in pixels and dtheta in degrees, push frame; 0 for objects out of sight.
         """
         return jnp.where(inputs.present[..., None, None], self.body(inputs, distances), 0.0)
 
 
-def symmetric(network: DIPN, inputs: PushInput, distances: jax.Array) -> jax.Array:
+def symmetric(network: DIPN, inputs: PushInput, distances: Float[Array, "B K"]) -> Float[jax.Array, "B N K 3"]:
     """Return the mean of the prediction and of the mirrored prediction for the mirrored push.
 
     Physics knows no left and right, so both are predictions of the same motion.

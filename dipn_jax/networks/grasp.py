@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.errors import UserError
@@ -59,7 +60,7 @@ class _PaperTrunk(nnx.Module):
         self.wide1 = resnet.conv(1, 1, (11, 57), rngs)
         self.wide2 = resnet.conv(1, 1, (11, 57), rngs)
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
         maps = self.trunk(x)
         y = self.lateral[3](maps[3])
         for level in (2, 1, 0):
@@ -84,8 +85,8 @@ class _CompactTrunk(nnx.Module):
         self.head = resnet.conv(fine, 2 * fine, 3, rngs)
         self.out = resnet.conv(2 * fine, CELL_PIXELS**2, 1, rngs)
 
-    def cells(self, x: jax.Array) -> jax.Array:
-        """Return logits `[B, h, w, 16]` of the pixels of cells `[B, h, w, 64]`; h and w even."""
+    def cells(self, x: Float[jax.Array, "B h w 64"]) -> Float[jax.Array, "B h w 16"]:
+        """Return logits of the pixels of cells; h and w even."""
         fine = nnx.relu(self.stem(x))
         coarse = nnx.relu(self.down(fine))
         for block in self.blocks:
@@ -93,7 +94,7 @@ class _CompactTrunk(nnx.Module):
         both = nnx.relu(fine + resnet.depth_to_space(self.up(coarse), 2))
         return self.out(nnx.relu(self.head(both)))
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
         return resnet.depth_to_space(self.cells(resnet.space_to_depth(x, CELL_PIXELS)), CELL_PIXELS)[..., 0]
 
 
@@ -104,38 +105,38 @@ class GraspNet(nnx.Module):
         self.config = config
         self.body = (_PaperTrunk if config.preset == "paper" else _CompactTrunk)(config, rngs)
 
-    def __call__(self, images: jax.Array) -> jax.Array:
-        """Return logits `[B, H, W]` of grasps centred on each pixel that close along the rows.
+    def __call__(self, images: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
+        """Return logits of grasps centred on each pixel that close along the rows.
 
         Args:
-          images: `[B, H, W, 4]` RGB in [0, 1] and height in metres; sides divisible by 8 (`paper`: 32).
+          images: RGB in [0, 1] and height in metres; sides divisible by 8 (`paper`: 32).
         """
         return self.body(_normalized(images))
 
 
-def _normalized(images: jax.Array) -> jax.Array:
+def _normalized(images: Float[jax.Array, "*b H W 4"]) -> Float[jax.Array, "*b H W 4"]:
     """Return images as the network gets them: the table is 0."""
     return (images - jnp.array([*render.TABLE_COLOR, 0.0])) / jnp.array(INPUT_SCALE)
 
 
 def score_image(
     network: GraspNet,
-    image: jax.Array,
+    image: Float[jax.Array, "224 224 4"],
     *,
     action: Literal["grasp", "push"] = "grasp",
     squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
-) -> jax.Array:
+) -> Float[jax.Array, "16 224 224"]:
     """Return the scores of all grasps, or all pushes, of one image.
 
     Args:
       network: GN, or another of its kind, in evaluation mode.
-      image: `[224, 224, 4]`.
+      image: RGB in [0, 1] and height in metres.
       action: grasps are scored by the `compact` network at half of the rotations, because a grasp turned by half a turn
         is the same grasp, and score 0 on empty table; pushes are scored at all rotations, and everywhere.
       squash: function from the network's outputs to scores.
 
     Returns:
-      Scores `[16, 224, 224]` in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
+      Scores in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
     """
     if network.config.preset == "compact":
         turns = ROTATIONS // 2 if action == "grasp" else ROTATIONS
@@ -151,8 +152,8 @@ def score_image(
     return jnp.where(image[..., 3] > fingers.EMPTY_HEIGHT, scores, 0.0) if action == "grasp" else scores
 
 
-def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
-    """Return the least score `[16, 224, 224]` of a grasp and its three mirror images, halved where fingers are blocked.
+def cautious_scores(network: GraspNet, image: Float[jax.Array, "224 224 4"]) -> Float[jax.Array, "16 224 224"]:
+    """Return the least score of a grasp and its three mirror images, halved where fingers are blocked.
 
     A mirror image of a grasp is as good as the grasp, and both mirrors map the 16 angles onto themselves, so there are
     four scores of each grasp. The best of a million scores is an overestimate; the least of four makes up for it.
@@ -169,8 +170,10 @@ def cautious_scores(network: GraspNet, image: jax.Array) -> jax.Array:
     return functools.reduce(jnp.minimum, answers) * (1 - fingers.blocked_image(image[..., 3]) / 2)
 
 
-def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:
-    """Return logits `[turns, 80, 80, 16]` of the pixels of all cells of the first `turns` turned views; `compact` only.
+def score_cells(
+    network: GraspNet, image: Float[jax.Array, "224 224 4"], turns: int
+) -> Float[jax.Array, "{turns} 80 80 16"]:
+    """Return logits of the pixels of all cells of the first `turns` turned views; `compact` only.
 
     Images are turned and cut into cells by a table that is made once.
     """
@@ -179,18 +182,20 @@ def score_cells(network: GraspNet, image: jax.Array, turns: int) -> jax.Array:
     return body.cells(flat_pixels(image)[there].reshape(*there.shape[:3], -1))
 
 
-def flat_pixels(image: jax.Array) -> jax.Array:
-    """Return the normalized pixels of an image `[H, W, 4]` as rows, and one more for the table (`turning_tables`)."""
+def flat_pixels(image: Float[jax.Array, "H W 4"]) -> Float[jax.Array, "H*W+1 4"]:
+    """Return the normalized pixels of an image as rows, and one more for the table (`turning_tables`)."""
     return jnp.concatenate([_normalized(image).reshape(-1, 4), jnp.zeros((1, 4))])
 
 
 @functools.cache
-def turning_tables(turns: int) -> tuple[np.ndarray, np.ndarray]:
+def turning_tables(
+    turns: int,
+) -> tuple[Int[np.ndarray, "{turns} 80 80 16"], Int[np.ndarray, "{turns} 224 224"]]:
     """Return from where each pixel is taken when the first `turns` rotations are applied, and undone.
 
     Returns:
-      For each pixel of each cell of the turned views, its pixel in the image `[turns, 80, 80, 16]` (the one past the
-      end is table); and for each pixel of each score map, its place in the logits of all cells `[turns, 224, 224]`.
+      For each pixel of each cell of the turned views, its pixel in the image (the one past the end is table); and for
+      each pixel of each score map, its place in the logits of all cells.
     """
     side, cells = WORKSPACE.pixels, VIEW_PIXELS // CELL_PIXELS
     with jax.ensure_compile_time_eval():

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.networks.grasp import (
@@ -53,16 +54,18 @@ _WIDER_CELLS = 2 * (FELT_PIXELS[0] - FELT_PIXELS[1]) // CELL_PIXELS
 
 
 @functools.cache
-def _weights() -> np.ndarray:
-    """Return the weight of each pixel of each cell `[8, 80, 80, 16]` in the mean over all score maps."""
+def _weights() -> Float[np.ndarray, "8 80 80 16"]:
+    """Return the weight of each pixel of each cell in the mean over all score maps."""
     half = ROTATIONS // 2
     _, back = turning_tables(half)
     count = np.bincount(back.reshape(-1), minlength=half * VIEW_PIXELS**2 + 1)[: half * VIEW_PIXELS**2]
     return (count / back.size).astype(np.float32).reshape(half, _VIEW_CELLS, _VIEW_CELLS, CELL_PIXELS**2)
 
 
-def _extents(changed: jax.Array, turns: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """Return the least (column, row) of pixels `changed [H, W]` in turned views, and their extent: `[T, 2]` pixels."""
+def _extents(
+    changed: Bool[jax.Array, "H W"], turns: Int[np.ndarray, " T"]
+) -> tuple[Float[jax.Array, "T 2"], Float[jax.Array, "T 2"]]:
+    """Return the least (column, row) of pixels `changed` in turned views, and their extent, in pixels."""
     size, far = changed.shape[0], 1e4
     place = jnp.arange(size) - (size - 1) / 2
     ends = jnp.stack([jnp.where(changed, place, far).min(1), jnp.where(changed, place, -far).max(1)])
@@ -74,8 +77,10 @@ def _extents(changed: jax.Array, turns: np.ndarray) -> tuple[jax.Array, jax.Arra
     return least, jnp.maximum(jnp.where(there, turned, -far).max(1) - least, 0.0)
 
 
-def _felt(cells: jax.Array, least: jax.Array, extent: jax.Array, axis: int) -> jax.Array:
-    """Return which columns (axis 0) or rows (axis 1) `cells [T, S]` have scores that a change alters."""
+def _felt(
+    cells: Int[jax.Array, "T S"], least: Float[jax.Array, "T 2"], extent: Float[jax.Array, "T 2"], axis: int
+) -> Bool[jax.Array, "T S"]:
+    """Return which columns (axis 0) or rows (axis 1) `cells` have scores that a change alters."""
     low, high = (
         least[:, axis, None] - FELT_PIXELS[axis],
         least[:, axis, None] + extent[:, axis, None] + FELT_PIXELS[axis],
@@ -83,13 +88,13 @@ def _felt(cells: jax.Array, least: jax.Array, extent: jax.Array, axis: int) -> j
     return (cells >= low // CELL_PIXELS) & (cells <= high // CELL_PIXELS)
 
 
-def _scores(logits: jax.Array, height: jax.Array) -> jax.Array:
+def _scores(logits: Float[jax.Array, "*b"], height: Float[jax.Array, "*b"]) -> Float[jax.Array, "*b"]:
     """Return the scores of pixels of normalized `height`; 0 on the table."""
     return jnp.where(height * INPUT_SCALE[3] > fingers.EMPTY_HEIGHT, nnx.sigmoid(logits), 0.0)
 
 
-def scores_now(network: GraspNet, now: jax.Array) -> jax.Array:
-    """Return scores of the cells of all turned views of an image `[224, 224, 4]`: `[8, 80, 80, 16]`."""
+def scores_now(network: GraspNet, now: Float[jax.Array, "224 224 4"]) -> Float[jax.Array, "8 80 80 16"]:
+    """Return scores of the cells of all turned views of an image."""
     half = ROTATIONS // 2
     there, _ = turning_tables(half)
     return _scores(score_cells(network, now, half), flat_pixels(now)[there][..., 3])
@@ -97,21 +102,21 @@ def scores_now(network: GraspNet, now: jax.Array) -> jax.Array:
 
 def rough_means(
     network: GraspNet,
-    now: jax.Array,
-    before: jax.Array,
-    images: jax.Array,
-    wanted: jax.Array,
+    now: Float[jax.Array, "224 224 4"],
+    before: Float[jax.Array, "8 80 80 16"],
+    images: Float[jax.Array, "P 224 224 4"],
+    wanted: Bool[jax.Array, " P"],
     *,
     turns: tuple[int, ...],
-) -> jax.Array:
-    """Return about how much `turns` change the mean of all scores from the present image to each image: `[P]`.
+) -> Float[jax.Array, " P"]:
+    """Return about how much `turns` change the mean of all scores from the present image to each image.
 
     Args:
       network: GN, `compact`, in evaluation mode.
-      now: `[224, 224, 4]`.
+      now: the present image.
       before: result of `scores_now`.
-      images: `[P, 224, 224, 4]`.
-      wanted: `[P]` bool; others get 0.
+      images: the others.
+      wanted: which of them; others get 0.
       turns: rotations, of the first eight.
     """
     which = np.array(turns)
@@ -149,18 +154,23 @@ def rough_means(
     return jax.lax.map(one, (images, wanted))
 
 
-def appraise(network: GraspNet, now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the mean and the highest of all scores on each image; see `planner.Appraiser`.
+def mean_and_best(
+    network: GraspNet,
+    now: Float[jax.Array, "224 224 4"],
+    images: Float[jax.Array, "P 224 224 4"],
+    wanted: Bool[jax.Array, " P"],
+) -> tuple[Float[jax.Array, " P+1"], Float[jax.Array, " P+1"]]:
+    """Return the mean and the highest of all scores on each image; see `planner.ScoreSummary`.
 
     Args:
       network: GN, `compact`, in evaluation mode.
-      now: `[224, 224, 4]`.
-      images: `[P, 224, 224, 4]`.
-      wanted: `[P]` bool.
+      now: the present image.
+      images: the others.
+      wanted: which of them.
 
     Returns:
-      `[1 + P]` each, of `now` first. Exact for the FINALISTS best images (for all if no more than SCORED_WHOLE are
-      wanted); the others get the least of the exact values.
+      Both of `now` first. Exact for the FINALISTS best images (for all if no more than SCORED_WHOLE are wanted); the
+      others get the least of the exact values.
     """
     count = len(wanted)
 

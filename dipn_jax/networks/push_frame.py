@@ -11,11 +11,12 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.networks import losses
 from dipn_jax.sight import masks
-from dipn_jax.structs import ABSENT, Push, Pytree
+from dipn_jax.structs import ABSENT, Array, Push, Pytree
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS, WORKSPACE
 
 START_PIXEL = (40.0, 112.0)
@@ -61,24 +62,27 @@ COMPACT = View(64, 4, context=True)
 
 @flax.struct.dataclass
 class PushInput(Pytree):
-    """DIPN's input for one push, in the push frame; M is 224, C is `View.crop_side`; with `context`, M is 0."""
+    """DIPN's input for one push, in the push frame.
 
-    push_map: jax.Array  # [M, M] float: M_p
-    scene_map: jax.Array  # [M, M] float: M_I, 1 on any object
-    crops: jax.Array  # [N, C, C, 1 or 5] float: M_i about c_i; with `context` others, sweep, own height, others' height
-    outlines: jax.Array  # [N, OUTLINE_DIRECTIONS, 2] metres from c_i: see `outlines`; without `context` [N, 0, 2]
-    centers: jax.Array  # [N, 2] c_i, metres from the start
-    present: jax.Array  # [N] bool: objects in sight
+    M is 224, C is `View.crop_side`, F is 1, D is 0; with `context`, M is 0, F is 5, D is OUTLINE_DIRECTIONS.
+    """
+
+    push_map: Float[Array, "*b M M"]  # M_p
+    scene_map: Float[Array, "*b M M"]  # M_I, 1 on any object
+    crops: Float[Array, "*b N C C F"]  # M_i about c_i; with `context` others, sweep, own height, others' height
+    outlines: Float[Array, "*b N D 2"]  # metres from c_i: see `outlines`
+    centers: Float[Array, "*b N 2"]  # c_i, metres from the start
+    present: Bool[Array, "*b N"]  # objects in sight
 
 
-def _sweep(xy: jax.Array, distance: float) -> jax.Array:
-    """Return 1 where the closed gripper passes, else 0; `xy [..., 2]` metres from the start, push frame."""
+def _sweep(xy: Float[jax.Array, "*b 2"], distance: float) -> Float[jax.Array, "*b"]:
+    """Return 1 where the closed gripper passes, else 0; `xy` in metres from the start, push frame."""
     inside = (xy[..., 0] >= -GRIPPER.pad_width / 2) & (xy[..., 0] <= distance + GRIPPER.pad_width / 2)
     return (inside & (jnp.abs(xy[..., 1]) <= GRIPPER.push_width / 2)).astype(jnp.float32)
 
 
-def push_ends(distance: jax.Array) -> jax.Array:
-    """Return start and end `[..., 4]` of pushes by `distance [...]` metres, in units of the map's side."""
+def push_ends(distance: Float[Array, "*b"]) -> Float[jax.Array, "*b 4"]:
+    """Return start and end of pushes by `distance` metres, in units of the map's side."""
     origin = np.array(START_PIXEL, np.float32) / WORKSPACE.pixels
     end = origin[0] + distance / WORKSPACE.side
     fixed = [jnp.full_like(end, value) for value in (*origin, origin[1])]
@@ -86,19 +90,19 @@ def push_ends(distance: jax.Array) -> jax.Array:
 
 
 def push_input(
-    label: jax.Array, height: jax.Array, push: Push, *, slots: int, view: View
-) -> tuple[PushInput, jax.Array]:
+    label: Int[Array, "H W"], height: Float[Array, "H W"], push: Push, *, slots: int, view: View
+) -> tuple[PushInput, Float[jax.Array, "{slots} 2"]]:
     """Move the camera's maps into the frame of one push.
 
     Args:
-      label: `[224, 224]` int32.
-      height: `[224, 224]` metres; used only with `context`.
+      label: object slots, 224 x 224.
+      height: metres, 224 x 224; used only with `context`.
       push: one push.
-      slots: N.
+      slots: number of object slots.
       view: how to sample.
 
     Returns:
-      The network's input, and the mask centroids `[N, 2]` in the workspace (metres).
+      The network's input, and the mask centroids in the workspace (metres).
     """
     centers, area = masks.mask_centers(label, slots)
     start_offset = np.array(START_PIXEL, np.float32)
@@ -136,23 +140,28 @@ def push_input(
     return inputs, centers
 
 
-def directions() -> np.ndarray:
-    """Return unit vectors `[OUTLINE_DIRECTIONS, 2]` of the directions of outlines."""
+def directions() -> Float[np.ndarray, "32 2"]:
+    """Return unit vectors of the directions of outlines."""
     angle = np.arange(OUTLINE_DIRECTIONS) * 2 * np.pi / OUTLINE_DIRECTIONS
     return np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
 
 
-def outlines(label: jax.Array, height: jax.Array, angle: jax.Array, centers: jax.Array) -> jax.Array:
+def outlines(
+    label: Int[Array, "H W"],
+    height: Float[Array, "H W"],
+    angle: Float[Array, ""] | float,
+    centers: Float[Array, "N 2"],
+) -> Float[jax.Array, "N 32 2"]:
     """Return support functions of the masks: how far each reaches from its centroid, in directions turned by `angle`.
 
     Args:
-      label: `[H, W]` int32.
-      height: `[H, W]` metres.
-      angle: `[]` radians.
-      centers: `[N, 2]` metres, workspace (`masks.mask_centers`).
+      label: object slots.
+      height: metres.
+      angle: radians.
+      centers: metres, workspace (`masks.mask_centers`).
 
     Returns:
-      `[N, OUTLINE_DIRECTIONS, 2]` metres, to pixel centres: of the whole mask, and of its part that is as high as the
+      Metres, to pixel centres, in each of the directions: of the whole mask, and of its part that is as high as the
       fingertips of a push. 0 where a mask is empty.
     """
     normal = geometry.rotate2d(directions(), angle)
@@ -161,7 +170,7 @@ def outlines(label: jax.Array, height: jax.Array, angle: jax.Array, centers: jax
     corner = jnp.clip(corner, 0, np.array(label.shape[::-1]) - OUTLINE_WINDOW)
     level = jnp.where(height > GRIPPER.push_tip, 2, 1)
 
-    def reach(slot: jax.Array, at: jax.Array, center: jax.Array) -> jax.Array:
+    def reach(slot: jax.Array, at: jax.Array, center: Array) -> jax.Array:
         cut = lambda image: jax.lax.dynamic_slice(image, (at[1], at[0]), (OUTLINE_WINDOW, OUTLINE_WINDOW))  # noqa: E731
         tall = jnp.where(cut(label) == slot, cut(level), 0)
         x, y = ((jnp.arange(OUTLINE_WINDOW) + at[k] - middle[k]) * WORKSPACE.pixel - center[k] for k in range(2))
@@ -188,9 +197,9 @@ def over_batch(function: Callable[..., Any], *rows: Any) -> Any:
 
 @functools.partial(jax.jit, static_argnames=("slots", "view"))
 def push_inputs(
-    labels: jax.Array, heights: jax.Array, pushes: Push, *, slots: int, view: View
-) -> tuple[PushInput, jax.Array]:
-    """Apply `push_input` to a batch: labels and heights `[B, 224, 224]`, pushes `[B]`."""
+    labels: Int[Array, "B H W"], heights: Float[Array, "B H W"], pushes: Push, *, slots: int, view: View
+) -> tuple[PushInput, Float[jax.Array, "B {slots} 2"]]:
+    """Apply `push_input` to a batch: labels, heights and as many pushes."""
     return over_batch(functools.partial(push_input, slots=slots, view=view), labels, heights, pushes)
 
 
@@ -211,22 +220,22 @@ def mirror(inputs: PushInput) -> PushInput:
     )
 
 
-def mirror_motion(motion: jax.Array) -> jax.Array:
-    """Return motions `[..., 3]` (push frame) as seen in the same mirror."""
+def mirror_motion(motion: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+    """Return motions (push frame) as seen in the same mirror."""
     return motion * jnp.array([1.0, -1.0, -1.0])
 
 
-def to_workspace(motion: jax.Array, angle: jax.Array) -> jax.Array:
-    """Turn network output `[..., N, 3]` (pixels, degrees, push frame) into metres and radians, workspace.
+def to_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
+    """Turn network output (pixels, degrees, push frame) into metres and radians, workspace.
 
-    `angle [...]` is the direction of the push.
+    `angle` is the direction of the push, in radians.
     """
     metric = motion / losses.PIXELS_DEGREES
     shift = geometry.rotate2d(metric[..., :2], angle[..., None])
     return jnp.concatenate([shift, metric[..., 2:]], -1)
 
 
-def from_workspace(motion: jax.Array, angle: jax.Array) -> jax.Array:
+def from_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
     """Return the inverse of `to_workspace`."""
     shift = geometry.rotate2d(motion[..., :2], -angle[..., None])
     return jnp.concatenate([shift, motion[..., 2:]], -1) * losses.PIXELS_DEGREES

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Bool, Float, Shaped
 
 SMALL_MAP = 2
 """Pixels along a side of a map up to which a convolution is written as one matrix product."""
@@ -21,8 +22,10 @@ class Conv(nnx.Conv):
     channels on 56 maps of 2x2 pixels 70 times, an 11x57 of one channel 10 times.
     """
 
-    def __call__(self, x: jax.Array) -> jax.Array:  # type: ignore[override]
-        """Convolve `[B, H, W, C]` to `[B, H / stride, W / stride, features]`."""
+    def __call__(  # type: ignore[override]
+        self, x: Float[jax.Array, "B H W C"]
+    ) -> Float[jax.Array, "B h w {self.out_features}"]:
+        """Convolve maps, to a resolution lower by the stride."""
         kernel, bias = self.kernel[...], 0.0 if self.bias is None else self.bias[...]
         size, step = kernel.shape[0], self.strides[0]  # type: ignore[index]
         if kernel.shape[:2] == (1, 1):
@@ -34,8 +37,8 @@ class Conv(nnx.Conv):
         return super().__call__(x)
 
 
-def _banded(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Convolve maps `[B, H, W]` of one channel with a kernel of odd sides, by a matrix product for each of its rows."""
+def _banded(x: Float[jax.Array, "B H W"], kernel: Float[jax.Array, "rows cols"]) -> Float[jax.Array, "B H W"]:
+    """Convolve maps of one channel with a kernel of odd sides, by a matrix product for each of its rows."""
     (rows, cols), (height, width) = kernel.shape, x.shape[1:]
     offset = np.arange(width)[:, None] - np.arange(width) + cols // 2
     inside = (offset >= 0) & (offset < cols)
@@ -44,8 +47,8 @@ def _banded(x: jax.Array, kernel: jax.Array) -> jax.Array:
     return sum(x[:, i : i + height] @ bands[i] for i in range(rows))  # type: ignore[return-value]
 
 
-def _patches(x: jax.Array, size: int, step: int) -> jax.Array:
-    """Return every `size` x `size` neighbourhood of a map, flattened: `[B, H / step, W / step, size^2 C]`."""
+def _patches(x: Float[jax.Array, "B H W C"], size: int, step: int) -> Float[jax.Array, "B h w {size}**2*C"]:
+    """Return every `size` x `size` neighbourhood of a map, at a resolution lower by `step`, flattened."""
     rows, cols = (side + 2 * (size // 2) - size + 1 for side in x.shape[1:3])
     edge = (size // 2, size // 2)
     x = jnp.pad(x, ((0, 0), edge, edge, (0, 0)))
@@ -53,7 +56,7 @@ def _patches(x: jax.Array, size: int, step: int) -> jax.Array:
     return jnp.concatenate(shifted, -1)
 
 
-def max_pool(x: jax.Array) -> jax.Array:
+def max_pool(x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B h w C"]:
     """Return the largest of 3 x 3 at stride 2; written out, because XLA differentiates `nnx.max_pool` slowly on a CPU.
 
     It takes 12 times as long.
@@ -91,7 +94,9 @@ class Bottleneck(nnx.Module):
                 [conv(features_in, out, 1, rngs, stride=stride, bias=False), nnx.BatchNorm(out, rngs=rngs)]
             )
 
-    def __call__(self, x: jax.Array, mask: jax.Array | None = None) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B H W C"], mask: Bool[jax.Array, "B 1 1 1"] | None = None
+    ) -> Float[jax.Array, "B h w F"]:
         y = nnx.relu(self.norms[0](self.reduce(x), mask=mask))
         y = nnx.relu(self.norms[1](self.spatial(y), mask=mask))
         y = self.norms[2](self.expand(y), mask=mask)
@@ -103,8 +108,8 @@ class Bottleneck(nnx.Module):
 class ResNet(nnx.Module):
     """Bottleneck ResNet; `stages=(3, 4, 6, 3)` is ResNet-50.
 
-    Input `[B, H, W, C]`; returns the four stages' maps at strides 4, 8, 16, 32 with 256, 512, 1024 and
-    2048 channels. `mask [B]` bool leaves images out of the batch statistics.
+    Returns the four stages' maps at strides 4, 8, 16, 32 with 256, 512, 1024 and 2048 channels. `mask`
+    leaves images out of the batch statistics.
     """
 
     def __init__(self, features_in: int, stages: Sequence[int], rngs: nnx.Rngs) -> None:
@@ -120,7 +125,7 @@ class ResNet(nnx.Module):
             blocks.append(nnx.List(row))
         self.blocks = nnx.List(blocks)
 
-    def __call__(self, x: jax.Array, mask: jax.Array | None = None) -> list[jax.Array]:
+    def __call__(self, x: Float[jax.Array, "B H W C"], mask: Bool[jax.Array, " B"] | None = None) -> list[jax.Array]:
         mask = None if mask is None else mask[:, None, None, None]
         x = nnx.relu(self.stem_norm(self.stem(x), mask=mask))
         x = max_pool(x)
@@ -140,7 +145,7 @@ class PlainBlock(nnx.Module):
         zero = functools.partial(Conv, kernel_init=nnx.initializers.zeros)
         self.second = zero(features, features, (3, 3), strides=(1, 1), padding="SAME", rngs=rngs)
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W C"]:
         return nnx.relu(x + self.second(nnx.relu(self.first(x))))
 
 
@@ -155,7 +160,7 @@ class MLP(nnx.Module):
         self.layers = nnx.List(layers)
         self.linear_end = linear_end
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "*b F"]) -> Float[jax.Array, "*b G"]:
         for i, layer in enumerate(self.layers):
             x = layer(x)
             if i + 1 < len(self.layers) or not self.linear_end:
@@ -163,20 +168,24 @@ class MLP(nnx.Module):
         return x
 
 
-def space_to_depth(x: jax.Array, block: int) -> jax.Array:
-    """Fold blocks of pixels into channels: `[B, H, W, C]` to `[B, H / block, W / block, block^2 C]`."""
+def space_to_depth(
+    x: Shaped[jax.Array, "B H W C"], block: int
+) -> Shaped[jax.Array, "B H//{block} W//{block} {block}**2*C"]:
+    """Fold blocks of pixels into channels."""
     b, h, w, c = x.shape
     x = x.reshape(b, h // block, block, w // block, block, c).transpose(0, 1, 3, 2, 4, 5)
     return x.reshape(b, h // block, w // block, block * block * c)
 
 
-def depth_to_space(x: jax.Array, block: int) -> jax.Array:
+def depth_to_space(
+    x: Shaped[jax.Array, "B H W C"], block: int
+) -> Shaped[jax.Array, "B H*{block} W*{block} C//{block}**2"]:
     """Return the inverse of `space_to_depth`."""
     b, h, w, c = x.shape
     x = x.reshape(b, h, w, block, block, c // block**2).transpose(0, 1, 3, 2, 4, 5)
     return x.reshape(b, h * block, w * block, c // block**2)
 
 
-def upsample2(x: jax.Array) -> jax.Array:
-    """Double the resolution of `[B, H, W, C]` by repeating pixels."""
+def upsample2(x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B 2*H 2*W C"]:
+    """Double the resolution of maps by repeating pixels."""
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)

@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Bool, Float
 
 from dipn_jax.networks import push_frame, resnet
 from dipn_jax.networks.push_frame import OUTLINE_DIRECTIONS, PushInput, View
+from dipn_jax.structs import Array
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS, WORKSPACE
 
 STEP_CENTIMETRES = 2
@@ -40,20 +42,22 @@ GRIPPER_REACH = (np.abs(_NORMALS) @ np.array([GRIPPER.pad_width / 2, GRIPPER.pus
 """Support function of the closed gripper that pushes to +x `[OUTLINE_DIRECTIONS]`, metres."""
 
 
-def turn(reach: jax.Array, angle: jax.Array) -> jax.Array:
-    """Turn support functions `[..., D, F]` of outlines by `angle [...]` radians; linear between directions."""
+def turn(reach: Float[jax.Array, "*b D F"], angle: Float[jax.Array, "*b"]) -> Float[jax.Array, "*b D F"]:
+    """Turn support functions of outlines by `angle` radians; linear between directions."""
     d = reach.shape[-2]
     back = jnp.arange(d) - angle[..., None] * (d / (2 * np.pi))
     apart = jnp.abs((back[..., :, None] - jnp.arange(d) + d / 2) % d - d / 2)
     return jnp.einsum("...km,...mf->...kf", jnp.maximum(0.0, 1 - apart), reach)
 
 
-def gaps(offset: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
-    """Return the distance of outlines `[..., D]` along each direction; their middles are `offset [..., 2]` apart."""
+def gaps(
+    offset: Float[jax.Array, "*#b 2"], first: Float[Array, "*#b D"], second: Float[jax.Array, "*#b D"]
+) -> Float[jax.Array, "*b D"]:
+    """Return the distance of outlines along each direction; their middles are `offset` metres apart."""
     return offset @ _NORMALS.T - first - jnp.roll(second, OUTLINE_DIRECTIONS // 2, -1)
 
 
-def _near(gap: jax.Array) -> jax.Array:
+def _near(gap: Float[jax.Array, "*b"]) -> Float[jax.Array, "*b"]:
     """Return gaps (metres) as the network gets them: cut off to what matters within a step, and scaled."""
     return jnp.clip(gap, LEAST_GAP, LARGEST_GAP) * GAP_SCALE
 
@@ -79,15 +83,16 @@ class Stepwise(nnx.Module):
         self.memory = nnx.Linear(f, f, rngs=rngs)
         self.motion = resnet.MLP(f, (f, 3 * STEP_CENTIMETRES), rngs, linear_end=True)
 
-    def __call__(self, inputs: PushInput) -> jax.Array:
-        """Return motions `[B, N, PUSH_STEPS, 3]` (pixels, degrees, push frame) after every centimetre."""
+    def __call__(self, inputs: PushInput) -> Float[jax.Array, "B N 10 3"]:
+        """Return motions (pixels, degrees, push frame) after every centimetre."""
         b, n = inputs.present.shape
-        outline = inputs.outlines
-        code = self._encode(inputs.crops.reshape(b * n, *inputs.crops.shape[2:])).reshape(b, n, -1)
-        seen = [code, OUTLINE_SCALE * outline.reshape(b, n, -1), PLACE_SCALE * inputs.centers]
+        outline, centers = jnp.asarray(inputs.outlines), jnp.asarray(inputs.centers)
+        crops = jnp.asarray(inputs.crops)
+        code = self._encode(crops.reshape(b * n, *crops.shape[2:])).reshape(b, n, -1)
+        seen = [code, OUTLINE_SCALE * outline.reshape(b, n, -1), PLACE_SCALE * centers]
         hidden = self.begin(jnp.concatenate(seen, -1))
-        others = inputs.present[:, None, :, None] & ~jnp.eye(n, dtype=bool)[None, :, :, None]
-        place, angle = inputs.centers, jnp.zeros((b, n))
+        others = jnp.asarray(inputs.present)[:, None, :, None] & ~jnp.eye(n, dtype=bool)[None, :, :, None]
+        place, angle = centers, jnp.zeros((b, n))
         moved = jnp.zeros((b, n, 3))
         course = []
         for step in range(0, PUSH_STEPS, STEP_CENTIMETRES):
@@ -96,22 +101,27 @@ class Stepwise(nnx.Module):
             knots = moved[:, :, None] + jnp.cumsum(delta, 2)
             course.append(knots)
             moved = knots[:, :, -1]
-            place = inputs.centers + moved[..., :2] * WORKSPACE.pixel
+            place = centers + moved[..., :2] * WORKSPACE.pixel
             angle = moved[..., 2] * (np.pi / 180)
         return jnp.concatenate(course, 2)
 
-    def _encode(self, crops: jax.Array) -> jax.Array:
-        """Return features `[B N, F]` of crops `[B N, C, C, 5]`."""
+    def _encode(self, crops: Float[jax.Array, "B C C F"]) -> Float[jax.Array, "B G"]:
+        """Return features of crops."""
         x = self.block(nnx.relu(self.stem(resnet.space_to_depth(crops, FOLDED_SAMPLES))))
         x = nnx.relu(self.down(x))
         return nnx.relu(self.code(x.reshape(x.shape[0], -1)))
 
     def _advance(
-        self, hidden: jax.Array, ahead: jax.Array, place: jax.Array, reach: jax.Array, others: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Return memory `[B, N, F]` and motion of each centimetre `[B, N, STEP_CENTIMETRES, 3]` after one step.
+        self,
+        hidden: Float[jax.Array, "B N F"],
+        ahead: Float[jax.Array, "B N 2"],
+        place: Float[jax.Array, "B N 2"],
+        reach: Float[jax.Array, "B N D 2"],
+        others: Bool[jax.Array, "B N N 1"],
+    ) -> tuple[Float[jax.Array, "B N F"], Float[jax.Array, "B N 2 3"]]:
+        """Return memory and motion of each centimetre after one step.
 
-        `ahead [B, N, 2]` are places from the gripper, metres.
+        `ahead` are places from the gripper, `place` the same in the push frame, metres.
         """
         b, n, _ = hidden.shape
         whole, tall = reach[..., 0], reach[..., 1]

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jaxtyping import Float
 
 from dipn_jax.errors import UserError
 from dipn_jax.networks import resnet
@@ -47,13 +48,13 @@ class _Layer(nnx.Module):
         self.reduce = resnet.conv(features_in, 4 * GROWTH_RATE, 1, rngs, bias=False)
         self.spatial = resnet.conv(4 * GROWTH_RATE, GROWTH_RATE, 3, rngs, bias=False)
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W G"]:
         y = self.reduce(nnx.relu(self.norms[0](x)))
         return jnp.concatenate([x, self.spatial(nnx.relu(self.norms[1](y)))], -1)
 
 
 class DenseNet(nnx.Module):
-    """The features of a DenseNet: `[B, H, W, 3]` to `[B, H / 32, W / 32, features]`."""
+    """The features of a DenseNet, at stride 32."""
 
     def __init__(self, blocks: tuple[int, ...], rngs: nnx.Rngs) -> None:
         self.stem = resnet.conv(3, 2 * GROWTH_RATE, 7, rngs, stride=2, bias=False)
@@ -69,7 +70,7 @@ class DenseNet(nnx.Module):
         self.blocks, self.norms, self.downs = nnx.List(rows), nnx.List(norms), nnx.List(downs)
         self.features = features
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W 3"]) -> Float[jax.Array, "B h w {self.features}"]:
         x = resnet.max_pool(nnx.relu(self.stem_norm(self.stem(x))))
         for i, row in enumerate(self.blocks):
             for layer in row:
@@ -90,8 +91,8 @@ class _Trunks(nnx.Module):
         self.norms = nnx.List([nnx.BatchNorm(f, rngs=rngs) for f in (both, 64)])
         self.head = nnx.List([resnet.conv(both, 64, 1, rngs, bias=False), resnet.conv(64, 1, 1, rngs, bias=False)])
 
-    def __call__(self, images: jax.Array) -> jax.Array:
-        """Return a map `[B, H, W]` of images `[B, H, W, 4]`; sides divisible by 16."""
+    def __call__(self, images: Float[jax.Array, "B H W 4"]) -> Float[jax.Array, "B H W"]:
+        """Return a map of each image; sides divisible by 16."""
         b, h, w, _ = images.shape
         x = (images - jnp.array([*render.TABLE_COLOR, 0.0])) / jnp.array(INPUT_SCALE)
         x = jax.image.resize(x, (b, 2 * h, 2 * w, 4), "bilinear")

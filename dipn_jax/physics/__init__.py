@@ -11,6 +11,7 @@ from types import ModuleType
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from dipn_jax.engine import Engine, EngineName, PhysicsConfig
 from dipn_jax.errors import UserError
@@ -29,17 +30,23 @@ ENOUGH_CORES = 8
 """Cores with which `native` is as fast as `mjx` on a large GPU (docs/benchmarks.md: an H200 does the work of 8.4)."""
 
 
-def fence_force(mass: Array, position: Array, velocity: Array, *, xp: ModuleType = jnp) -> Array:
+def fence_force(
+    mass: Float[Array, "*b N"],
+    position: Float[Array, "*b N 2"],
+    velocity: Float[Array, "*b N 2"],
+    *,
+    xp: ModuleType = jnp,
+) -> Float[Array, "*b N 2"]:
     """Return the forces of a fence on objects; it has no surface, so any number of objects costs no contact.
 
     Args:
-      mass: `[..., N]` kg.
-      position: `[..., N, 2]` metres, workspace: centres of mass.
-      velocity: `[..., N, 2]` m/s.
+      mass: kg.
+      position: metres, workspace: centres of mass.
+      velocity: m/s.
       xp: numpy or jax.numpy.
 
     Returns:
-      Forces `[..., N, 2]` in newtons: zero within FENCE, a damped spring beyond.
+      Forces in newtons: zero within FENCE, a damped spring beyond.
     """
     beyond = position - xp.clip(position, -FENCE, FENCE)
     pull = -(FENCE_RATE**2) * beyond - 2 * FENCE_RATE * velocity

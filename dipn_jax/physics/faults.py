@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax.structs import Array, Fault, Scene
 from dipn_jax.workspace import WORKSPACE
@@ -33,17 +34,17 @@ and more on top of an object.
 """
 
 
-def speed(scenes: Scene, velocity: Array, *, xp: ModuleType = jnp) -> Array:
+def speed(scenes: Scene, velocity: Float[Array, "B N 6"], *, xp: ModuleType = jnp) -> Float[Array, "B N"]:
     """Return the speed `[B, N]` (m/s) of the centres of objects with `velocity [B, N, 6]`; 0 for empty slots."""
     return xp.where(scenes.shape >= 0, xp.sqrt((velocity[..., :3] ** 2).sum(-1)), 0.0)
 
 
-def off_path(hand: Array, target: Array, *, xp: ModuleType = jnp) -> Array:
+def off_path(hand: Float[Array, "B 3"], target: Float[Array, "B 3"], *, xp: ModuleType = jnp) -> Float[Array, " B"]:
     """Return the largest difference `[B]` (metres, along an axis) of `hand [B, 3]` and its `target [B, 3]`."""
     return xp.abs(hand - target).max(-1)
 
 
-def _fastest(scenes: Scene, velocity: Array, xp: ModuleType) -> Array:
+def _fastest(scenes: Scene, velocity: Float[Array, "B N 6"], xp: ModuleType) -> Float[Array, " B"]:
     """Return an upper bound `[B]` (m/s) of the speed of any point of any object."""
     radius = xp.linalg.norm(scenes.size, axis=-1) / 2
     spin = xp.where(scenes.shape >= 0, xp.linalg.norm(velocity[..., 3:], axis=-1) * radius, 0.0)
@@ -52,20 +53,20 @@ def _fastest(scenes: Scene, velocity: Array, xp: ModuleType) -> Array:
 
 def codes(
     scenes: Scene,
-    position: Array,
-    velocity: Array,
-    hand: Array,
-    target: Array,
+    position: Float[Array, "B N 7"],
+    velocity: Float[Array, "B N 6"],
+    hand: Float[Array, "B 3"],
+    target: Float[Array, "B 3"],
     *,
-    top: Array,
-    stray: Array,
-    broken: Array,
-    full: Array,
-    depth: Array,
-    deepest: Array,
-    settle: Array | bool,
+    top: Float[Array, " B"],
+    stray: Float[Array, " B"],
+    broken: Bool[Array, " B"],
+    full: Bool[Array, " B"],
+    depth: Float[Array, " B"],
+    deepest: Float[Array, " B"],
+    settle: Bool[Array, ""] | bool,
     xp: ModuleType = jnp,
-) -> Array:
+) -> Int[Array, " B"]:
     """Return fault codes at the end of a rollout.
 
     Args:
@@ -84,7 +85,7 @@ def codes(
       xp: numpy or jax.numpy.
 
     Returns:
-      `[B]` int32, bits of `Fault`.
+      Bits of `Fault`.
     """
     present = scenes.shape >= 0
     outside = (xp.abs(position[..., :2]) > WORKSPACE.half).any(-1) & present

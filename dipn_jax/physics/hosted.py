@@ -58,7 +58,7 @@ def follow(
     fence: float,
 ) -> Rollout:
     """Run `sims` along `trajectories`; `scenes` and `slots` are from `pack`, the rest as in `Engine.simulate`."""
-    present = scenes.shape >= 0
+    present = np.asarray(scenes.shape >= 0)
     mass = np.where(present, scenes.mass, 0.0)
     ticks = np.round(samples / physics.CONTROL_PERIOD).astype(int)
     last = int(ticks[-1])
@@ -114,7 +114,7 @@ class Watch:
         present = self.scenes.shape >= 0
         finite = np.isfinite(self.fastest)
         stray = self.off.max(-1)
-        return faults.codes(
+        codes = faults.codes(
             self.scenes,
             qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7),
             self.velocity(),
@@ -129,6 +129,7 @@ class Watch:
             settle=settle,
             xp=np,
         )
+        return np.asarray(codes)
 
 
 def pack(scenes: Scene, poses: np.ndarray) -> tuple[Scene, np.ndarray]:

@@ -17,7 +17,7 @@ from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig
 from dipn_jax.physics import colliders, faults, prisms, recording
 from dipn_jax.physics.recording import Record, State
-from dipn_jax.structs import Rollout, Scene, Trajectory
+from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import model, shapes
 from dipn_jax.world.model import GRIPPER_DOF
@@ -96,13 +96,18 @@ class Program:
         last = ticks.max()
         state, record = jax.lax.fori_loop(0, last, body, (state, record))
         record = recording.store(record, state, ticks == last)
-        end = target(last * physics.CONTROL_PERIOD)
-        fault = faults.codes(
+        fault = self._fault(scenes, state, record, target(last * physics.CONTROL_PERIOD), settle)
+        kept = jnp.where(present[:, None, :, None], record.poses, poses[:, None])
+        return Rollout(kept, record.gripper, fault)
+
+    def _fault(self, scenes: Scene, state: State, record: Record, target: jax.Array, settle: jax.Array) -> Array:
+        """Return fault codes `[B]` at the end of a rollout, where the gripper should be at `target [B, 6]`."""
+        return faults.codes(
             scenes,
-            state.qpos[:, GRIPPER_DOF:].reshape(*present.shape, 7),
+            state.qpos[:, GRIPPER_DOF:].reshape(*scenes.shape.shape, 7),
             recording.velocity(state, scenes),
             state.qpos[:, :3],
-            end[:, :3],
+            target[:, :3],
             top=record.top,
             stray=record.stray,
             broken=record.broken,
@@ -111,8 +116,6 @@ class Program:
             deepest=record.deepest,
             settle=settle,
         )
-        kept = jnp.where(present[:, None, :, None], record.poses, poses[:, None])
-        return Rollout(kept, record.gripper, fault)
 
     def _initial(self, poses: jax.Array, ctrl: jax.Array) -> State:
         rest = jnp.zeros(self.base.nv, jnp.float32)

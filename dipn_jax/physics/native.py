@@ -9,6 +9,7 @@ import threading
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 from mujoco import batch as mujoco_batch
 
 from dipn_jax import physics, structs
@@ -43,9 +44,9 @@ class NativeEngine:
     def simulate(
         self,
         scenes: Scene,
-        poses: Array,
+        poses: Float[Array, "B N 7"],
         trajectories: Trajectory,
-        samples: Array,
+        samples: Float[Array, " S"],
         *,
         settle: bool = False,
         fence: float = 0.0,
@@ -138,16 +139,18 @@ def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray) -> np.ndarray
     return deepest
 
 
-def raycast(scenes: Scene, poses: Array, *, pixels: int = WORKSPACE.pixels) -> tuple[np.ndarray, np.ndarray]:
+def raycast(
+    scenes: Scene, poses: Float[Array, "B N 7"], *, pixels: int = WORKSPACE.pixels
+) -> tuple[Float[np.ndarray, "B {pixels} {pixels}"], Int[np.ndarray, "B {pixels} {pixels}"]]:
     """Return what MuJoCo's ray caster sees from straight above: the reference of `dipn_jax.sight.render`.
 
     Args:
-      scenes: `[B, N, ...]`.
-      poses: `[B, N, 7]`.
+      scenes: B scenes.
+      poses: metres and quaternions wxyz, workspace.
       pixels: side of the square view, 2 mm a pixel.
 
     Returns:
-      Heights `[B, pixels, pixels]` in metres and labels (object slots, ABSENT on the table) of the same shape.
+      Heights in metres and labels (object slots, ABSENT on the table).
     """
     scenes, poses = jax.tree.map(np.asarray, scenes), np.asarray(poses)
     models = [

@@ -13,9 +13,10 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from mujoco.mjx._src.types import ConvexMesh
 
-from dipn_jax.structs import Pytree
+from dipn_jax.structs import Array, Pytree
 from dipn_jax.world import shapes
 from dipn_jax.world.shapes import CORNERS, CORNERS_USED, SIDES, UNIT_VERTICES
 
@@ -27,10 +28,10 @@ _DEAD_RADIUS = -1e3
 class Parts(Pytree):
     """The convex parts of one object in the form that MJX takes: each about its own centre."""
 
-    center: jax.Array  # [P, 3] metres, object's frame: a point inside
-    radius: jax.Array  # [P] metres: ball about the centre; negative where there is no part
+    center: Float[Array, "*b P 3"]  # metres, object's frame: a point inside
+    radius: Float[Array, "*b P"]  # metres: ball about the centre; negative where there is no part
     mesh: ConvexMesh  # leaves [P, ...], metres, relative to the centre
-    alive: jax.Array  # [P] bool
+    alive: Bool[Array, "*b P"]  # whether there is such a part
 
 
 def _faces() -> np.ndarray:
@@ -77,12 +78,12 @@ _FACES = _complete(_faces())
 _EDGES, _BESIDE = (_complete(table) for table in _edges())
 
 
-def parts(shape: jax.Array, size: jax.Array) -> Parts:
+def parts(shape: Int[Array, ""] | int, size: Float[Array, " 3"]) -> Parts:
     """Return the hulls of one object's parts.
 
     Args:
-      shape: `[]` int, index into `shapes.CLASSES`; ABSENT gives dead parts.
-      size: `[3]` metres, bounding box.
+      shape: index into `shapes.CLASSES`; ABSENT gives dead parts.
+      size: metres, bounding box.
 
     Returns:
       Parts with leaves `[P, ...]`, relative to each part's centre. Values of dead parts are finite.

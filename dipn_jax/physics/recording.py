@@ -5,6 +5,7 @@ from __future__ import annotations
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from dipn_jax import physics
 from dipn_jax.physics import faults
@@ -16,26 +17,26 @@ from dipn_jax.world.model import GRIPPER_DOF
 class State(Pytree):
     """State that passes from one substep to the next."""
 
-    qpos: jax.Array  # [6 + 7 N]
-    qvel: jax.Array  # [6 + 6 N]
-    warmstart: jax.Array  # [6 + 6 N]
-    full: jax.Array  # [] bool: contacts or geom pairs were left out
-    depth: jax.Array  # [] metres: deepest contact
+    qpos: Float[jax.Array, "*b Q"]  # the gripper's six, then seven an object: see world.model
+    qvel: Float[jax.Array, "*b V"]  # six and six
+    warmstart: Float[jax.Array, "*b V"]  # accelerations that the solver starts from
+    full: Bool[Array, "*b"]  # contacts or geom pairs were left out
+    depth: Float[Array, "*b"]  # metres: deepest contact
 
 
 @flax.struct.dataclass
 class Record(Pytree):
-    """Record of a rollout so far; every field has a leading `[B]`."""
+    """Record of a rollout so far."""
 
-    poses: Array  # [S, N, 7]
-    gripper: Array  # [S, 5]
-    top: Array  # [] m/s: highest speed of a present object
-    stray: Array  # [] metres: farthest that the hand was off its path
-    broken: Array  # [] bool
-    deepest: Array  # [] metres: contact, where depth counts
+    poses: Float[Array, "*b S N 7"]  # metres and quaternions wxyz, workspace
+    gripper: Float[Array, "*b S 5"]  # as Trajectory.target, as reached
+    top: Float[Array, "*b"]  # m/s: highest speed of a present object
+    stray: Float[Array, "*b"]  # metres: farthest that the hand was off its path
+    broken: Bool[Array, "*b"]  # something was not finite
+    deepest: Float[Array, "*b"]  # metres: contact, where depth counts
 
 
-def hold_in(mass: jax.Array, state: State) -> jax.Array:
+def hold_in(mass: Float[Array, "B N"], state: State) -> Float[jax.Array, "B 6+6*N"]:
     """Return the fence's generalized forces `[B, 6 + 6 N]` on objects of `mass [B, N]`, which is 0 for empty slots."""
     position = state.qpos[:, GRIPPER_DOF:].reshape(*mass.shape, 7)[..., :2]
     velocity = state.qvel[:, GRIPPER_DOF:].reshape(*mass.shape, 6)[..., :2]
@@ -43,10 +44,10 @@ def hold_in(mass: jax.Array, state: State) -> jax.Array:
     return jnp.pad(force.reshape(len(mass), -1), ((0, 0), (GRIPPER_DOF, 0)))
 
 
-def control(trajectories: Trajectory, time: Array | float) -> jax.Array:
+def control(trajectories: Trajectory, time: Float[Array, ""] | float) -> Float[jax.Array, "B 6"]:
     """Return actuator set points `[B, 6]` at `time`: linear between key frames, half the gap a finger."""
 
-    def one(times: jax.Array, targets: jax.Array) -> jax.Array:
+    def one(times: Array, targets: Array) -> jax.Array:
         index = jnp.clip((times <= time).sum() - 1, 0, len(times) - 2)
         span = jnp.maximum(times[index + 1] - times[index], 1e-9)
         weight = jnp.clip((time - times[index]) / span, 0.0, 1.0)
@@ -56,7 +57,7 @@ def control(trajectories: Trajectory, time: Array | float) -> jax.Array:
     return jax.vmap(one)(trajectories.time, trajectories.target)
 
 
-def store(record: Record, state: State, now: jax.Array) -> Record:
+def store(record: Record, state: State, now: Bool[Array, " S"]) -> Record:
     """Store the present state as those samples that are taken `now [S]`."""
     gripper, poses = state.qpos[:, :GRIPPER_DOF], state.qpos[:, GRIPPER_DOF:]
     gripper = jnp.concatenate([gripper[:, :4], gripper[:, 4:].sum(-1, keepdims=True)], -1)
@@ -67,13 +68,13 @@ def store(record: Record, state: State, now: jax.Array) -> Record:
     )
 
 
-def velocity(state: State, scenes: Scene) -> jax.Array:
+def velocity(state: State, scenes: Scene) -> Float[jax.Array, "B N 6"]:
     """Return the velocities of the objects `[B, N, 6]`."""
     return state.qvel[:, GRIPPER_DOF:].reshape(*scenes.shape.shape, 6)
 
 
-def watch(record: Record, state: State, scenes: Scene, target: jax.Array, *, deep: jax.Array) -> Record:
-    """Note speeds, depths (if `deep []`), what is not finite, and how far the hand is off its `target [B, 6]`."""
+def watch(record: Record, state: State, scenes: Scene, target: Float[Array, "B 6"], *, deep: Bool[Array, ""]) -> Record:
+    """Note speeds, depths (if `deep`), what is not finite, and how far the hand is off its `target`."""
     linear = faults.speed(scenes, velocity(state, scenes))
     finite = jnp.isfinite(state.qpos).all(-1) & jnp.isfinite(state.qvel).all(-1)
     top = jnp.maximum(record.top, jnp.where(finite, linear.max(-1), 0.0))

@@ -9,6 +9,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int, Key
 
 from dipn_jax import geometry
 from dipn_jax.sight import fingers, masks
@@ -36,7 +37,13 @@ _OVERSAMPLE = 4
 
 
 @functools.partial(jax.jit, static_argnames="count")
-def sample_pushes(key: jax.Array, observation: Observation, *, count: int, distance: Array) -> tuple[Push, jax.Array]:
+def sample_pushes(
+    key: Key[Array, ""],
+    observation: Observation,
+    *,
+    count: int,
+    distance: Float[Array, ""] | Float[Array, " {count}"] | float,
+) -> tuple[Push, Bool[jax.Array, " {count}"]]:
     """Candidate pushes of one observation.
 
     Args:
@@ -70,21 +77,23 @@ def sample_pushes(key: jax.Array, observation: Observation, *, count: int, dista
     return Push(start[chosen], angle[chosen], distances), feasible[chosen]
 
 
-def push_at(index: Array, distance: Array) -> Push:
+def push_at(index: Int[Array, " 3"], distance: Float[Array, ""] | float) -> Push:
     """The push that starts at `index [3]` (rotation, row, col) and goes `distance []` metres."""
     index = jnp.asarray(index)
     start = geometry.pixels_to_metres(jnp.stack([index[2], index[1]], -1))
     return Push(start, index[0] * jnp.float32(2 * jnp.pi / ROTATIONS), jnp.float32(distance))
 
 
-def push_index(push: Push) -> jax.Array:
+def push_index(push: Push) -> Int[jax.Array, " 3"]:
     """The pixel and direction nearest to a push: `[3]` int32 (rotation, row, col)."""
     pixel = jnp.round(geometry.metres_to_pixels(push.start))
     rotation = jnp.round(push.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
     return jnp.stack([rotation, pixel[1], pixel[0]]).astype(jnp.int32)
 
 
-def stays_inside(centers: jax.Array, area: jax.Array, motion: jax.Array) -> jax.Array:
+def stays_inside(
+    centers: Float[Array, "N 2"], area: Float[Array, " N"], motion: Float[Array, "N 3"]
+) -> Bool[jax.Array, ""]:
     """Whether no visible centre `[N, 2]` (metres) leaves CENTER_RANGE by `motion [N, 3]`."""
     pixel = geometry.metres_to_pixels(centers + motion[:, :2])
     before = geometry.metres_to_pixels(centers)
@@ -93,7 +102,7 @@ def stays_inside(centers: jax.Array, area: jax.Array, motion: jax.Array) -> jax.
     return ~(out.any(-1) & (area > 0)).any()
 
 
-def grasp_at(index: Array, height: jax.Array) -> Grasp:
+def grasp_at(index: Int[Array, "*b 3"], height: Float[Array, "H W"]) -> Grasp:
     """The grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres).
 
     The tips go to `fingers.grasp_height`. Where a finger would press on something on its way there they stop above it,
@@ -109,7 +118,7 @@ def grasp_at(index: Array, height: jax.Array) -> Grasp:
     return Grasp(center, angle, jnp.maximum(goal, jnp.minimum(contact, highest)))
 
 
-def grasp_index(grasp: Grasp) -> jax.Array:
+def grasp_index(grasp: Grasp) -> Int[jax.Array, "*b 3"]:
     """Inverse of `grasp_at`: `[..., 3]` int32 (rotation, row, col)."""
     pixel = jnp.round(geometry.metres_to_pixels(grasp.center))
     rotation = jnp.round(grasp.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
@@ -117,7 +126,7 @@ def grasp_index(grasp: Grasp) -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnames="count")
-def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Grasp:
+def random_grasps(key: Key[Array, ""], observation: Observation, *, count: int) -> Grasp:
     """`count` grasps at uniformly random foreground pixels, each at one of the 16 angles."""
     pixel_key, angle_key = jax.random.split(key)
     noise = jax.random.uniform(pixel_key, (observation.label.size,))
@@ -128,7 +137,13 @@ def random_grasps(key: jax.Array, observation: Observation, *, count: int) -> Gr
 
 
 def sample_grasps(
-    key: jax.Array, observation: Observation, scores: jax.Array, *, count: int, guided: Array, hard: Array
+    key: Key[Array, ""],
+    observation: Observation,
+    scores: Float[Array, "R H W"],
+    *,
+    count: int,
+    guided: Float[Array, ""] | float,
+    hard: Float[Array, ""] | float,
 ) -> Grasp:
     """Draw `count` grasps: some that a scorer believes in, some that it is unsure of, the others at random.
 
@@ -159,14 +174,14 @@ def sample_grasps(
     return jax.tree.map(pick, chosen, anywhere)
 
 
-def best_grasp(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
+def best_grasp(scores: Float[Array, "R H W"]) -> tuple[Int[jax.Array, " 3"], Float[jax.Array, ""]]:
     """The best of scores `[16, H, W]`: index `[3]` (rotation, row, col) and its score."""
     flat = jnp.argmax(scores)
     index = jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
     return index, scores.reshape(-1)[flat]
 
 
-def discount_missed(scores: jax.Array, missed: Array) -> jax.Array:
+def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) -> Float[jax.Array, "R H W"]:
     """Halve scores `[16, H, W]` near grasps that missed, once for each of them.
 
     Args:
@@ -183,7 +198,7 @@ def discount_missed(scores: jax.Array, missed: Array) -> jax.Array:
     return jnp.minimum(scores, scores * 0.5**count)
 
 
-def best_grasps(scores: jax.Array, *, count: int, apart: float = 8.0) -> jax.Array:
+def best_grasps(scores: Float[Array, "R H W"], *, count: int, apart: float = 8.0) -> Int[jax.Array, "{count} 3"]:
     """The `count` best of scores `[16, H, W]` that are at least `apart` pixels from one another: `[count, 3]`."""
     grid = geometry.view_grid(*scores.shape[1:])
 

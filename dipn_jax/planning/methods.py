@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int, Key
 
 from dipn_jax.errors import UserError
 from dipn_jax.networks import vpg
@@ -45,15 +46,17 @@ class Policy:
 
     act: Act
     rule: Rule
-    distances: np.ndarray  # [P] metres, of the candidates
+    distances: Float[Array, " P"]  # metres, of the candidates
 
-    def __call__(self, key: jax.Array, observation: Observation, *, missed: Array = planner.NONE_MISSED) -> Decision:
+    def __call__(
+        self, key: Key[Array, ""], observation: Observation, *, missed: Int[Array, "M 3"] = planner.NONE_MISSED
+    ) -> Decision:
         """Decide on one table.
 
         Args:
           key: random key, for the candidates.
           observation: what the camera sees.
-          missed: `[M, 3]` int32 grasps (rotation, row, col) that missed on this table as it is.
+          missed: grasps (rotation, row, col) that missed on this table as it is.
         """
         return self.act(key, observation, missed, self.rule, self.distances)
 
@@ -79,8 +82,8 @@ class PolicyConfig:
         result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above)
         return result
 
-    def spread(self) -> np.ndarray:
-        """The distance of each candidate `[P]`, metres."""
+    def spread(self) -> Float[np.ndarray, " P"]:
+        """Return the distance of each candidate in metres."""
         return np.resize(np.asarray(self.distances, np.float32), self.candidates)
 
 

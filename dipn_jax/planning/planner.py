@@ -13,6 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int, Key
 
 from dipn_jax.planning import candidates
 from dipn_jax.sight import fingers, imagine, masks, render
@@ -42,13 +43,19 @@ class Rule(Pytree):
     decision = dipn_jax.decide(key, observation, predictor, scorer, rule=dipn_jax.Rule(gamma=0.8))
     """
 
-    gamma: Array = 0.9  # discount of a push's value
-    grasp_above: Array = 0.7  # grasp at once if the best score is higher; 1 switches this short cut off
-    edge_factor: Array = 1.0  # a predicted motion is multiplied by it to judge whether an object leaves the workspace
+    gamma: Float[Array, ""] | float = 0.9  # discount of a push's value
+    grasp_above: Float[Array, ""] | float = (
+        0.7  # grasp at once if the best score is higher; 1 switches this short cut off
+    )
+    edge_factor: Float[Array, ""] | float = (
+        1.0  # a predicted motion is multiplied by it to judge whether an object leaves the workspace
+    )
     # clauses that only DIPN's released code has
-    grasp_lone: Array = False  # a lone object is grasped
-    push_must_raise_best: Array = False  # a push must raise the best score, too
-    discount_above: Array = 0.0  # gamma discounts only pushes after which the best score is higher (released: 0.5)
+    grasp_lone: Bool[Array, ""] | bool = False  # a lone object is grasped
+    push_must_raise_best: Bool[Array, ""] | bool = False  # a push must raise the best score, too
+    discount_above: Float[Array, ""] | float = (
+        0.0  # gamma discounts only pushes after which the best score is higher (released: 0.5)
+    )
 
 
 RELEASED = Rule(edge_factor=2.0, grasp_lone=True, push_must_raise_best=True, discount_above=0.5)
@@ -75,14 +82,14 @@ def _mean_and_best(scores: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def find_candidates(
-    key: jax.Array,
+    key: Key[Array, ""],
     observation: Observation,
     scorer: Scorer,
     rule: Rule,
     *,
     count: int,
-    distance: Array,
-    missed: Array = NONE_MISSED,
+    distance: Float[Array, "*p"] | float,
+    missed: Int[Array, "M 3"] = NONE_MISSED,
 ) -> Candidates:
     """Score all grasps and sample `count` pushes; arguments as of `decide`."""
     now = scorer(render.rgbd(observation)[None])[0]
@@ -94,7 +101,7 @@ def find_candidates(
 
 
 def decide_among(
-    observation: Observation, found: Candidates, motion: jax.Array, summarize: ScoreSummary, rule: Rule
+    observation: Observation, found: Candidates, motion: Float[Array, "P N 3"], summarize: ScoreSummary, rule: Rule
 ) -> Decision:
     """Choose between the best grasp and the best push, given what each push would do.
 
@@ -143,16 +150,16 @@ def decide_among(
 
 @functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "summarize"))
 def decide(
-    key: jax.Array,
+    key: Key[Array, ""],
     observation: Observation,
     predictor: Predictor,
     scorer: Scorer,
     *,
     count: int = 32,
-    distance: Array = 0.1,
+    distance: Float[Array, "*p"] | float = 0.1,
     rule: Rule = Rule(),  # noqa: B008
     summarize: ScoreSummary | None = None,
-    missed: Array = NONE_MISSED,
+    missed: Int[Array, "M 3"] = NONE_MISSED,
 ) -> Decision:
     """Choose between the best grasp and the best push (Alg. 2 of the paper).
 
@@ -186,9 +193,9 @@ def decide_by_value(
     push_scorer: Scorer,
     scorer: Scorer,
     *,
-    distance: jax.Array | float,
-    grasp_above: jax.Array | float = jnp.inf,
-    missed: Array = NONE_MISSED,
+    distance: Float[Array, ""] | float,
+    grasp_above: Float[Array, ""] | float = jnp.inf,
+    missed: Int[Array, "M 3"] = NONE_MISSED,
 ) -> Decision:
     """Choose the best of all grasps or the best of all pushes by their values, imagining nothing, as VPG does.
 

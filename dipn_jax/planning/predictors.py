@@ -8,20 +8,21 @@ import pathlib
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jaxtyping import Float
 
 from dipn_jax.networks import dipn, push_frame
 from dipn_jax.planning.planner import Predictor
 from dipn_jax.sight import imagine
 from dipn_jax.storage import checkpoint
-from dipn_jax.structs import ABSENT, Observation, Push
+from dipn_jax.structs import ABSENT, Array, Observation, Push
 
 
-def static_predictor(observation: Observation, pushes: Push) -> jax.Array:
+def static_predictor(observation: Observation, pushes: Push) -> Float[jax.Array, "P N 3"]:
     """Baseline: nothing moves; a Predictor."""
     return jnp.zeros((pushes.angle.shape[0], observation.slots, 3))
 
 
-def trans_predictor(observation: Observation, pushes: Push) -> jax.Array:
+def trans_predictor(observation: Observation, pushes: Push) -> Float[jax.Array, "P N 3"]:
     """Baseline: only the pushed object moves, by the push length along the push; a Predictor."""
 
     def one(label: jax.Array, push: Push) -> jax.Array:
@@ -32,17 +33,19 @@ def trans_predictor(observation: Observation, pushes: Push) -> jax.Array:
     return jax.vmap(one, in_axes=(None, 0))(observation.label, pushes)
 
 
-def dipn_motions(model: dipn.DIPN, observation: Observation, pushes: Push, distances: jax.Array) -> jax.Array:
+def dipn_motions(
+    model: dipn.DIPN, observation: Observation, pushes: Push, distances: Float[Array, "P K"]
+) -> Float[jax.Array, "P K N 3"]:
     """Predict motions by pushes `[P]`, each on its own observation `[P, H, W]` or all on the same `[H, W]`.
 
     Args:
       model: in evaluation mode.
       observation: its labels are the masks, from the simulator or found in the image.
       pushes: `[P]`; their own distance is not looked at.
-      distances: `[P, K]` metres.
+      distances: metres.
 
     Returns:
-      `[P, K, N, 3]`: dx, dy (metres) of each mask's centroid, dtheta (radians), workspace.
+      dx, dy (metres) of each mask's centroid, dtheta (radians), workspace.
     """
     slots, view = observation.slots, model.config.view
     if observation.label.ndim == 2:

@@ -53,7 +53,7 @@ def grasp_summary(model: grasp.GraspNet) -> ScoreSummary:
     thaw = _frozen(model)
 
     def summarize(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return local.appraise(thaw(), now, images, wanted)  # type: ignore[arg-type]
+        return local.mean_and_best(thaw(), now, images, wanted)  # type: ignore[arg-type]
 
     return summarize
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from dipn_jax import geometry
 from dipn_jax.structs import Array
@@ -34,20 +35,22 @@ HIDDEN_HEIGHT = 1.0
 """Metres: how high such an object is taken to be out of sight."""
 
 
-def grasp_height(local_height: Array) -> jax.Array:
-    """Tip height for a surface `local_height [...]` metres above the table. Source: DIPN's released code."""
+def grasp_height(local_height: Float[Array, "*b"] | float) -> Float[jax.Array, "*b"]:
+    """Tip height for a surface `local_height` metres above the table. Source: DIPN's released code."""
     return jnp.maximum(jnp.asarray(local_height) - 0.04, 0.02)
 
 
-def under_fingers(height: jax.Array, center: jax.Array, angle: jax.Array) -> jax.Array:
-    """The highest point `[...]`, metres, that the open fingers of grasps come down on.
+def under_fingers(
+    height: Float[Array, "H W"], center: Float[Array, "*b 2"], angle: Float[Array, "*b"]
+) -> Float[jax.Array, "*b"]:
+    """The highest point, metres, that the open fingers of grasps come down on.
 
     What reaches the border of the map is taken to go on beyond it.
 
     Args:
-      height: `[H, W]` metres.
-      center: `[..., 2]` metres.
-      angle: `[...]` radians, of the closing axis.
+      height: metres.
+      center: metres, workspace.
+      angle: radians, of the closing axis.
     """
     step = WORKSPACE.pixel / 2
     off = jnp.arange(GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness + step, step)
@@ -58,8 +61,10 @@ def under_fingers(height: jax.Array, center: jax.Array, angle: jax.Array) -> jax
     return geometry.sample_nearest(height, pixels).max(-1)
 
 
-def footprint_free(height: jax.Array, start: jax.Array, angle: jax.Array) -> jax.Array:
-    """Whether the closed gripper can come down at `start [2]` (metres), broad side toward `angle []`."""
+def footprint_free(
+    height: Float[Array, "H W"], start: Float[Array, " 2"], angle: Float[Array, ""] | float
+) -> Bool[jax.Array, ""]:
+    """Whether the closed gripper can come down at `start` (metres), broad side toward `angle` (radians)."""
     along = jnp.linspace(-0.5, 0.5, 7) * (GRIPPER.pad_width + _MARGIN)
     across = jnp.linspace(-0.5, 0.5, 13) * (GRIPPER.push_width + _MARGIN)
     local = jnp.stack(jnp.meshgrid(along, across, indexing="ij"), -1).reshape(-1, 2)
@@ -67,8 +72,8 @@ def footprint_free(height: jax.Array, start: jax.Array, angle: jax.Array) -> jax
     return jnp.all(geometry.sample_nearest(height, pixels, 0.0) < FREE_HEIGHT)
 
 
-def pushable(height: jax.Array) -> jax.Array:
-    """Where the closed gripper can come down, in each direction: `[16, H, W]` bool of a height map `[H, W]`."""
+def pushable(height: Float[Array, "H W"]) -> Bool[jax.Array, "16 H W"]:
+    """Where on a height map the closed gripper can come down, in each direction."""
     size = height.shape[0]
     rows, cols = (2 * math.ceil(side / 2 / WORKSPACE.pixel) + 1 for side in (GRIPPER.push_width, GRIPPER.pad_width))
     pixel = jnp.arange(size)
@@ -84,7 +89,7 @@ def pushable(height: jax.Array) -> jax.Array:
     return jnp.tile(half < FREE_HEIGHT, (2, 1, 1)) & near[:, None] & near
 
 
-def geometric_labels(height: jax.Array) -> jax.Array:
+def geometric_labels(height: Float[jax.Array, "H W"]) -> Float[jax.Array, "H W"]:
     """Which grasps are free of physics' objections, from the height map of a turned view alone.
 
     A grasp centred on a pixel and closing along its row is positive when there is object between the
@@ -92,17 +97,17 @@ def geometric_labels(height: jax.Array) -> jax.Array:
     `FINGER_COLUMNS` on each side (DIPN's released code has rows +-4, columns 19 to 28 of its own gripper).
 
     Args:
-      height: `[H, W]` metres.
+      height: metres.
 
     Returns:
-      `[H, W]` float, 1 for positive.
+      1 for positive, 0 else.
     """
     tip = grasp_height(height)
     return ((height > tip + MIN_DEPTH) & (_under_fingers(height) < tip)).astype(jnp.float32)
 
 
-def _under_fingers(height: jax.Array) -> jax.Array:
-    """The highest point, metres, that the fingers of a grasp centred on each pixel `[H, W]` come down on."""
+def _under_fingers(height: Float[Array, "H W"]) -> Float[jax.Array, "H W"]:
+    """The highest point, metres, that the fingers of a grasp centred on each pixel come down on."""
 
     def highest(low: int, high: int, half_rows: int) -> jax.Array:
         rows, cols = 2 * half_rows + 1, high - low + 1
@@ -118,13 +123,13 @@ def _under_fingers(height: jax.Array) -> jax.Array:
     return jnp.maximum(highest(-far, -near, rows), highest(near, far, rows))
 
 
-def label_image(height: jax.Array) -> jax.Array:
-    """`geometric_labels` of every grasp on a height map `[224, 224]`: `[16, 224, 224]`, as `score_image`."""
+def label_image(height: Float[Array, "224 224"]) -> Float[jax.Array, "16 224 224"]:
+    """`geometric_labels` of every grasp on a height map, as `score_image`."""
     return _of_every_grasp(height, geometric_labels)
 
 
-def blocked_image(height: jax.Array) -> jax.Array:
-    """Which grasps on a height map `[224, 224]` a finger stops short of: `[16, 224, 224]`, 1 where so, else 0.
+def blocked_image(height: Float[Array, "224 224"]) -> Float[jax.Array, "16 224 224"]:
+    """Which grasps on a height map a finger stops short of: 1 where so, else 0.
 
     It would come down on something that stands BLOCKED_HEIGHT over where its tip is to go, or out of sight near
     something that reaches the border.
@@ -139,8 +144,10 @@ def blocked_image(height: jax.Array) -> jax.Array:
     )
 
 
-def _of_every_grasp(height: jax.Array, judge: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """`judge` of turned views, turned back: `[16, 224, 224]`; a grasp turned by half a turn is the same grasp."""
+def _of_every_grasp(
+    height: Float[Array, "H W"], judge: Callable[[jax.Array], jax.Array]
+) -> Float[jax.Array, "16 224 224"]:
+    """`judge` of turned views, turned back; a grasp turned by half a turn is the same grasp."""
 
     def one(angle: jax.Array) -> jax.Array:
         return geometry.unrotate_map(judge(geometry.rotate_map(height, angle, TURNED_PIXELS)), angle, WORKSPACE.pixels)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.sight import render
-from dipn_jax.structs import ABSENT, Observation
+from dipn_jax.structs import ABSENT, Array, Observation
 from dipn_jax.workspace import WORKSPACE
 
 WINDOW = 80
@@ -15,16 +16,16 @@ WINDOW = 80
 
 
 @jax.jit
-def imagine(observation: Observation, centers: jax.Array, motion: jax.Array) -> Observation:
+def imagine(observation: Observation, centers: Float[Array, "N 2"], motion: Float[Array, "N 3"]) -> Observation:
     """Predict the observation after every object has moved rigidly in the plane.
 
         centers, _ = dipn_jax.sight.masks.mask_centers(observation.label, observation.slots)
         after = dipn_jax.imagine(observation, centers, motion)
 
     Args:
-      observation: `[224, 224]` maps before.
-      centers: `[N, 2]` metres, centroid of each visible mask (`masks.mask_centers`).
-      motion: `[N, 3]` dx, dy (metres) of that centroid and rotation about it (radians).
+      observation: maps before, 224 x 224.
+      centers: metres, centroid of each visible mask (`masks.mask_centers`).
+      motion: dx, dy (metres) of that centroid and rotation about it (radians).
 
     Returns:
       The predicted observation; where two objects overlap, the higher one is seen.
@@ -51,8 +52,10 @@ def imagine(observation: Observation, centers: jax.Array, motion: jax.Array) -> 
     return Observation(image[..., 3], image[..., :3], image[..., 4].astype(jnp.int32), observation.slots)
 
 
-def move_toward(label: jax.Array, start: jax.Array, angle: jax.Array) -> jax.Array:
-    """The object slot `[]` that the middle of a push from `start [2]` along `angle []` meets first; ABSENT if none."""
+def move_toward(
+    label: Int[Array, "H W"], start: Float[Array, " 2"], angle: Float[Array, ""] | float
+) -> Int[jax.Array, ""]:
+    """The object that the middle of a push from `start` (metres) along `angle` (radians) meets first, or ABSENT."""
     steps = jnp.arange(0.0, 0.2, WORKSPACE.pixel / 2)
     path = start + steps[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     met = geometry.sample_nearest(label, geometry.metres_to_pixels(path), ABSENT)

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
+from dipn_jax.structs import Array
 from dipn_jax.workspace import WORKSPACE
 
 _COLUMN_BITS = 20
 """Low bits of a packed sum that hold the sum of columns; the number of pixels is above them."""
 
 
-def mask_centers(label: jax.Array, slots: int) -> tuple[jax.Array, jax.Array]:
+def mask_centers(
+    label: Int[Array, "H W"], slots: int
+) -> tuple[Float[jax.Array, "{slots} 2"], Float[jax.Array, " {slots}"]]:
     """Return the centroids and sizes of the visible masks.
 
     Args:
-      label: `[H, W]` int32 object slots, ABSENT on the table.
-      slots: N.
+      label: object slots, ABSENT on the table.
+      slots: number of object slots.
 
     Returns:
-      Centroid `[N, 2]` in metres (workspace, of a map centred on it) and size `[N]` in pixels; the
-      centroid of an object out of sight is 0.
+      Centroids in metres (workspace, of a map centred on it) and sizes in pixels; the centroid of an
+      object out of sight is 0.
     """
     h, w = label.shape
     hot = label == jnp.arange(slots)[:, None, None]
@@ -44,8 +48,8 @@ def _row_sums(hot: jax.Array) -> tuple[jax.Array, jax.Array]:
     return count.astype(jnp.float32), total.astype(jnp.float32)
 
 
-def contour(foreground: jax.Array) -> jax.Array:
-    """Return the foreground pixels `[H, W]` bool with a neighbour (of eight) on the table or outside the map."""
+def contour(foreground: Bool[Array, "H W"]) -> Bool[Array, "H W"]:
+    """Return the foreground pixels with a neighbour (of eight) on the table or outside the map."""
     padded = jnp.pad(foreground, 1)
     across = padded[:, :-2] & padded[:, 1:-1] & padded[:, 2:]
     return foreground & ~(across[:-2] & across[1:-1] & across[2:])

@@ -11,6 +11,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax import batching, geometry
 from dipn_jax.structs import ABSENT, Array, Observation, Scene
@@ -24,8 +25,10 @@ _STEEP = 1e-6  # |n_z| below which a face is taken as vertical
 _FAR = 1e3
 
 
-def _bounds(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Affine bounds on z `[N, P, F, 3]` (constant, x, y), which of them are from above, and which parts there are."""
+def _bounds(
+    scene: Scene, poses: Float[Array, "N 7"]
+) -> tuple[Float[jax.Array, "N P F 3"], Bool[jax.Array, "N P F"], Bool[Array, "N P"]]:
+    """Affine bounds on z (constant, x, y), which of them are from above, and which parts there are."""
     hulls = jax.vmap(shapes.hull)(scene.shape, scene.size)
     rotation = geometry.quat_to_matrix(poses[:, 3:])
     with jax.default_matmul_precision("highest"):  # tenths of millimetres, which accelerators else round away
@@ -36,8 +39,10 @@ def _bounds(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     return plane, nz > 0, hulls.alive
 
 
-def _top(plane: jax.Array, above: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Top of a part over pixels `x [W]`, `y [H]`; `-_FAR` beside it. Planes `[F, 3]`, `[F]`."""
+def _top(
+    plane: Float[Array, "F 3"], above: Bool[Array, " F"], x: Float[Array, " W"], y: Float[Array, " H"]
+) -> Float[jax.Array, "H W"]:
+    """Top of a part over pixels at `x` and `y` (metres); `-_FAR` beside it."""
     top, bottom = jnp.float32(_FAR), jnp.float32(-_FAR)
     for face in range(plane.shape[0]):
         height = plane[face, 0] + plane[face, 1] * x[None, :] + plane[face, 2] * y[:, None]
@@ -46,8 +51,14 @@ def _top(plane: jax.Array, above: jax.Array, x: jax.Array, y: jax.Array) -> jax.
     return jnp.where(top >= bottom, top, -_FAR)
 
 
-def _tops(plane: jax.Array, above: jax.Array, alive: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Top of an object, as `_top`; planes `[P, F, 3]`. A missing part costs nothing where scenes are not vmapped."""
+def _tops(
+    plane: Float[Array, "P F 3"],
+    above: Bool[Array, "P F"],
+    alive: Bool[Array, " P"],
+    x: Float[Array, " W"],
+    y: Float[Array, " H"],
+) -> Float[jax.Array, "H W"]:
+    """Top of an object, as `_top`. A missing part costs nothing where scenes are not vmapped."""
     nothing = jnp.full((y.shape[0], x.shape[0]), -_FAR)
     best = nothing
     for part in range(plane.shape[0]):
@@ -57,16 +68,18 @@ def _tops(plane: jax.Array, above: jax.Array, alive: jax.Array, x: jax.Array, y:
 
 
 @functools.partial(jax.jit, static_argnames=("pixels",))
-def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> tuple[jax.Array, jax.Array]:
+def render_depth(
+    scene: Scene, poses: Float[Array, "N 7"], *, pixels: int = WORKSPACE.pixels
+) -> tuple[Float[jax.Array, "{pixels} {pixels}"], Int[jax.Array, "{pixels} {pixels}"]]:
     """Height map and labels of one scene.
 
     Args:
-      scene: `[N]`.
-      poses: `[N, 7]`, workspace frame.
+      scene: one scene (no batch axis).
+      poses: metres and quaternions wxyz, workspace frame.
       pixels: side of the square view, centred on the workspace, 2 mm a pixel.
 
     Returns:
-      Height `[pixels, pixels]` in metres (0 on the table) and label `[pixels, pixels]` int32 (ABSENT on the table).
+      Height in metres (0 on the table) and label (ABSENT on the table).
     """
     n = scene.shape.shape[0]
     side = min(WINDOW, pixels)
@@ -95,7 +108,7 @@ def render_depth(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixe
 
 
 @functools.partial(jax.jit, static_argnames=("pixels",))
-def render(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) -> Observation:
+def render(scene: Scene, poses: Float[Array, "N 7"], *, pixels: int = WORKSPACE.pixels) -> Observation:
     """Render what the camera sees of one scene; arguments as `render_depth`.
 
     names, scenes, poses = dipn_jax.load_cases()
@@ -106,23 +119,23 @@ def render(scene: Scene, poses: jax.Array, *, pixels: int = WORKSPACE.pixels) ->
     return Observation(height, paint_labels(label, scene.color), label, scene.shape.shape[0])
 
 
-def paint_labels(label: jax.Array, color: jax.Array) -> jax.Array:
-    """Colours `[H, W, 3]` of a label map `[H, W]` with object colours `[N, 3]`; the table elsewhere."""
+def paint_labels(label: Int[Array, "H W"], color: Float[Array, "N 3"]) -> Float[jax.Array, "H W 3"]:
+    """Colours of a label map with object colours (RGB in [0, 1]); the table elsewhere."""
     palette = jnp.concatenate([color, jnp.array([TABLE_COLOR])])
     return palette[jnp.where(label == ABSENT, color.shape[0], label)]
 
 
-def rgbd(observation: Observation) -> jax.Array:
-    """The image `[H, W, 4]` that networks see: RGB in [0, 1] and height in metres."""
+def rgbd(observation: Observation) -> Float[jax.Array, "*b H W 4"]:
+    """The image that networks see: RGB in [0, 1] and height in metres."""
     return jnp.concatenate([observation.color, observation.height[..., None]], -1)
 
 
-def observe(scene: Scene, poses: Array) -> Observation:
+def observe(scene: Scene, poses: Float[Array, "B N 7"]) -> Observation:
     """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
     return batching.in_batches(_observe, scene, poses)
 
 
 @jax.jit
-def _observe(scene: Scene, poses: jax.Array) -> Observation:
+def _observe(scene: Scene, poses: Float[Array, "B N 7"]) -> Observation:
     height, label = jax.lax.map(lambda pair: render_depth(*pair), (scene, poses))
     return Observation(height, jax.vmap(paint_labels)(label, scene.color), label, scene.shape.shape[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Int, Real
 
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Array
@@ -20,7 +21,7 @@ _REACH = 4  # pixels over which a fragment goes to a neighbour
 _MOST_REGIONS = 200
 
 
-def segment(height: Array, color: Array, *, slots: int) -> np.ndarray:
+def segment(height: Real[Array, "*any"], color: Real[Array, "*any"], *, slots: int) -> Int[np.ndarray, "224 224"]:
     """Instance masks of one image.
 
     Args:
@@ -29,7 +30,7 @@ def segment(height: Array, color: Array, *, slots: int) -> np.ndarray:
       slots: most masks wanted.
 
     Returns:
-      `[224, 224]` int32: 0 for the largest mask, 1 for the next, ..., ABSENT on the table and where there are more
+      0 for the largest mask, 1 for the next, ..., ABSENT on the table and where there are more
       than `slots`. Objects of one colour that touch are one mask.
 
     Raises:
@@ -125,16 +126,16 @@ def _fill(regions: np.ndarray, foreground: np.ndarray, slots: int) -> np.ndarray
     return label[full]
 
 
-def match(found: np.ndarray, true: np.ndarray, *, slots: int) -> np.ndarray:
+def match(found: Int[Array, "H W"], true: Int[Array, "H W"], *, slots: int) -> Int[np.ndarray, " {slots}"]:
     """Which found mask is which true one: the pair of the greatest IoU first, each mask once.
 
     Args:
-      found: `[H, W]` int labels.
-      true: `[H, W]` int labels.
+      found: labels.
+      true: labels.
       slots: labels are below.
 
     Returns:
-      `[slots]` int: found label of each true one, ABSENT where none overlaps.
+      Found label of each true one, ABSENT where none overlaps.
     """
     pair = np.zeros((slots + 1, slots + 1))
     np.add.at(pair, (np.asarray(true).ravel(), np.asarray(found).ravel()), 1)  # ABSENT is the last row and column
@@ -151,19 +152,21 @@ def match(found: np.ndarray, true: np.ndarray, *, slots: int) -> np.ndarray:
     return result
 
 
-def find(height: Array, color: Array, true: Array, *, slots: int) -> tuple[np.ndarray, np.ndarray]:
+def find(
+    height: Real[Array, "224 224"], color: Real[Array, "224 224 3"], true: Int[Array, "224 224"], *, slots: int
+) -> tuple[Int[np.ndarray, "224 224"], Bool[np.ndarray, " {slots}"]]:
     """Masks found in one image, numbered as the objects that they overlap most; the rest take the numbers left over.
 
     For training and measuring: what a network is shown is what the segmenter saw, and it is known of what.
 
     Args:
-      height: `[224, 224]` metres above the table.
-      color: `[224, 224, 3]` RGB in [0, 1].
-      true: `[224, 224]` int labels.
-      slots: N.
+      height: metres above the table.
+      color: RGB in [0, 1].
+      true: labels.
+      slots: number of object slots.
 
     Returns:
-      `[224, 224]` int32 labels, and which numbers are a mask of the object of that number, `[N]` bool.
+      Labels, and which numbers are a mask of the object of that number.
     """
     found = segment(height, color, slots=slots)
     matched = match(found, true, slots=slots)

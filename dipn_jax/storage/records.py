@@ -1,11 +1,4 @@
-"""The format of data sets, which only this module reads and writes.
-
-A data set is a folder of Parquet shards and a `manifest.json`. Every column is a leaf of an episode
-struct, flattened, and quantized as `codec` says; its shape, dtype and quantum, the schema version, the kind,
-the config and the versions of the packages that made it are in the shard's own metadata. A shard is
-written under a temporary name, synced and renamed, so a file with a shard's name is whole or was damaged
-later, which its SHA-256 shows.
-"""
+"""Data sets: folders of shards (`shards`) with a `manifest.json` that lists them and their SHA-256."""
 
 from __future__ import annotations
 
@@ -17,127 +10,13 @@ from typing import Any
 
 import jax
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from dipn_jax import files, structs
+from dipn_jax import files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import codec
+from dipn_jax.storage import shards
 
-SCHEMA_VERSION = 2
-"""Version of the format; shards of another version are refused."""
-COMPRESSION_LEVEL = 9
-"""Level of zstd; it takes a few milliseconds a shard, because bytes of the same place of all numbers are neighbours."""
-KINDS: dict[str, type] = {
-    "push": structs.PushEpisode,
-    "grasp": structs.GraspEpisode,
-    "images": structs.SettledScene,
-}
-"""Kinds of data sets, and the struct of their episodes."""
 MANIFEST = "manifest.json"
 """Name of the file that lists the shards of a data set."""
-_META_KEY = b"dipn_jax"
-"""Key of our entry in the metadata of a shard."""
-
-
-class DamagedShard(UserError):
-    """A file that was a shard, or has a shard's name, and cannot be read as one."""
-
-
-def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
-    """Return the path of shard `index` of a data set."""
-    return folder / f"shard-{index:05d}.parquet"
-
-
-def write_shard(
-    folder: pathlib.Path, index: int, episodes: Any, *, kind: str, config: Any, faults: dict[str, Any]
-) -> None:
-    """Write one shard.
-
-    Args:
-      folder: the data set.
-      index: the shard's number.
-      episodes: a struct of `KINDS[kind]` with a leading `[B]` axis.
-      kind: a key of KINDS.
-      config: what determines the data set, with its seed; it has to fit into JSON.
-      faults: counts of drops and faults.
-    """
-    columns, coded = codec.encode(codec.columns(episodes))
-    arrays, specs = [], {}
-    for name, value in columns.items():
-        flat = np.ascontiguousarray(value).reshape(len(value), -1)
-        arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(flat.reshape(-1)), flat.shape[1]))
-        specs[name] = {"dtype": str(value.dtype), "shape": list(value.shape[1:])} | coded.get(name, {})
-    meta = {
-        "schema_version": SCHEMA_VERSION,
-        "kind": kind,
-        "shard": index,
-        "columns": specs,
-        "config": config,
-        "faults": faults,
-        "versions": files.package_versions(),
-    }
-    table = pa.Table.from_arrays(arrays, names=list(columns))
-    table = table.replace_schema_metadata({_META_KEY: json.dumps(meta).encode()})
-    sink = pa.BufferOutputStream()
-    pq.write_table(
-        table,
-        sink,
-        compression="zstd",
-        compression_level=COMPRESSION_LEVEL,
-        use_dictionary=False,
-        column_encoding={f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in coded},
-        write_page_checksum=True,
-    )
-    files.write_atomically(shard_path(folder, index), sink.getvalue().to_pybytes())
-
-
-def read_meta(path: pathlib.Path) -> dict[str, Any]:
-    """Return the metadata of a shard.
-
-    Raises:
-      UserError: the file is missing, damaged, not a shard, or of another schema version.
-    """
-    try:
-        meta = json.loads(pq.read_schema(path).metadata[_META_KEY])
-    except FileNotFoundError:
-        raise UserError(f"shard {path}: not found; generate it again with dipn-datagen") from None
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
-        raise DamagedShard(
-            f"shard {path}: truncated, damaged or not a shard of this project; run dipn-datagen repair {path.parent}"
-        ) from None
-    if meta["schema_version"] != SCHEMA_VERSION:
-        raise UserError(
-            f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it anew elsewhere"
-        )
-    return meta
-
-
-def count(path: pathlib.Path) -> int:
-    """Return the number of episodes in a shard."""
-    read_meta(path)
-    return pq.read_metadata(path).num_rows
-
-
-def read_shard(path: pathlib.Path, *, kind: str) -> Any:
-    """Return the episodes of a shard: a struct of `KINDS[kind]` with a leading `[B]` axis, NumPy arrays.
-
-    Raises:
-      UserError: see `read_meta`; or the shard is of another kind.
-    """
-    meta = read_meta(path)
-    if meta["kind"] != kind:
-        raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
-    try:
-        table = pq.read_table(path, page_checksum_verification=True)
-    except (pa.ArrowException, OSError):
-        raise DamagedShard(f"shard {path}: damaged; run dipn-datagen repair {path.parent}") from None
-    columns = {}
-    for name, spec in meta["columns"].items():
-        flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        columns[name] = flat.astype(spec["dtype"]).reshape(len(table), *spec["shape"])
-    coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
-    return codec.assemble(KINDS[kind], codec.decode(columns, coded))
 
 
 def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
@@ -154,24 +33,24 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
 def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """Write the manifest anew, as `update_manifest` says, and return it."""
     known = _read_manifest(folder)["shards"] if (folder / MANIFEST).exists() else {}
-    shards: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for path in sorted(folder.glob("shard-*.parquet")):
         entry = known.get(path.name)
         if entry is None or entry["bytes"] != path.stat().st_size:
-            meta = read_meta(path)
+            meta = shards.read_meta(path)
             entry = {
-                "episodes": count(path),
+                "episodes": shards.count(path),
                 "bytes": path.stat().st_size,
                 "sha256": files.file_sha256(path),
                 "kind": meta["kind"],
                 "faults": meta["faults"],
             }
-        shards[path.name] = entry
+        entries[path.name] = entry
     manifest = {
-        "schema_version": SCHEMA_VERSION,
-        "kind": next((entry["kind"] for entry in shards.values()), None),
-        "episodes": sum(entry["episodes"] for entry in shards.values()),
-        "shards": shards,
+        "schema_version": shards.SCHEMA_VERSION,
+        "kind": next((entry["kind"] for entry in entries.values()), None),
+        "episodes": sum(entry["episodes"] for entry in entries.values()),
+        "shards": entries,
     }
     files.write_json(folder / MANIFEST, manifest)
     return manifest
@@ -204,7 +83,7 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
         elif files.file_sha256(path) != entry["sha256"]:
             problems.append((path, "SHA-256 differs from the manifest's"))
         else:
-            read_meta(path)  # of this schema version
+            shards.read_meta(path)  # of this schema version
     listed = set(manifest["shards"])
     problems += [(p, "not in the manifest") for p in sorted(folder.glob("shard-*.parquet")) if p.name not in listed]
     return problems
@@ -225,9 +104,9 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     removed = []
     for path in sorted(folder.glob("shard-*.parquet")):
         try:
-            read_shard(path, kind=read_meta(path)["kind"])
+            shards.read_shard(path, kind=shards.read_meta(path)["kind"])
             good = path.name not in known or files.file_sha256(path) == known[path.name]["sha256"]
-        except DamagedShard:
+        except shards.DamagedShard:
             good = False
         if not good:
             path.rename(path.with_suffix(".parquet.damaged"))
@@ -245,7 +124,7 @@ def summary(folder: pathlib.Path) -> dict[str, Any]:
         for name, count in entry["faults"].items():
             faults[name] = faults.get(name, 0) + count
     first = next(iter(manifest["shards"]), None)
-    meta = read_meta(folder / first) if first else {}
+    meta = shards.read_meta(folder / first) if first else {}
     return {
         "kind": manifest["kind"],
         "episodes": manifest["episodes"],
@@ -280,7 +159,7 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
 
     Args:
       folder: the data set.
-      kind: a key of KINDS.
+      kind: a key of `shards.KINDS`.
 
     Returns:
       The episodes `[B, ...]` in the order of the shards, and a fingerprint of the data set.
@@ -298,10 +177,10 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
         )
     if not manifest["shards"]:
         raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
-    shards = [read_shard(folder / name, kind=kind) for name in manifest["shards"]]
-    widths = {shard.scene.shape.shape[1] for shard in shards}
+    parts = [shards.read_shard(folder / name, kind=kind) for name in manifest["shards"]]
+    widths = {part.scene.shape.shape[1] for part in parts}
     if len(widths) > 1:
         raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
-    episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *shards)
+    episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     text = json.dumps([entry["sha256"] for entry in manifest["shards"].values()])
     return episodes, hashlib.sha256(text.encode()).hexdigest()

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from dipn_jax import geometry
 from dipn_jax.errors import UserError
@@ -22,9 +23,7 @@ def hard_cases_path() -> pathlib.Path:
     return pathlib.Path(__file__).parents[1] / "data" / "hard_cases.json"
 
 
-def load_cases(
-    path: pathlib.Path | str | None = None, *, slots: int | None = None
-) -> tuple[list[str], Scene, np.ndarray]:
+def load_cases(path: pathlib.Path, *, slots: int | None = None) -> tuple[list[str], Scene, Float[np.ndarray, "C N 7"]]:
     """Read a case file: hand-placed scenes in the format of `hard_cases.json`.
 
         names, scenes, poses = dipn_jax.load_cases()             # the ten hard tables
@@ -36,7 +35,7 @@ def load_cases(
       slots: padded number of objects; the largest case's by default.
 
     Returns:
-      Names, scenes `[C, N, ...]` and poses `[C, N, 7]` as placed: not settled. Density 500 kg/m^3, friction 0.35.
+      Names, scenes and poses of C cases as placed: not settled. Density 500 kg/m^3, friction 0.35.
 
     Raises:
       UserError: the file is missing, is not JSON, or an object in it has an unknown shape or a wrong size.
@@ -68,7 +67,7 @@ def load_cases(
     return names, scene, np.stack([p for _, p in loaded])
 
 
-def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, np.ndarray]:
+def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, Float[np.ndarray, "{n} 7"]]:
     objects = case["objects"]
     where = f"case file {path}, case {case.get('name', '?')}"
     shape = np.full(n, ABSENT, np.int32)
@@ -112,7 +111,7 @@ def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, np.n
     return scenes.nominal(Scene(shape, size, color, np.zeros(n), np.zeros(n))), poses
 
 
-def _numbers(values: Any, length: int) -> np.ndarray:
+def _numbers(values: Any, length: int) -> Float[np.ndarray, " {length}"]:
     array = np.asarray(values, np.float32)
     if array.shape != (length,) or not np.isfinite(array).all():
         raise ValueError(f"{values} is not {length} finite numbers")

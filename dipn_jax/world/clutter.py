@@ -6,6 +6,7 @@ import functools
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int, Key
 
 from dipn_jax import batching, structs
 from dipn_jax.engine import Engine
@@ -18,7 +19,7 @@ MAX_DROPS = 128
 
 
 def settled(
-    key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int
+    key: Key[Array, ""], engine: Engine, config: scenes.SceneConfig, count: int
 ) -> tuple[SettledScene, dict[str, int]]:
     """Drop `count` random scenes and keep those that came to rest inside the workspace without a fault.
 
@@ -40,7 +41,7 @@ def settled(
     return structs.take(everything, fault == 0), {"dropped_scenes": count, **counts}
 
 
-def settled_scenes(key: jax.Array, engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
+def settled_scenes(key: Key[Array, ""], engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
     """Drop random objects until `count` scenes have come to rest.
 
         engine, config = dipn_jax.make_engine("native"), dipn_jax.SceneConfig()
@@ -66,18 +67,18 @@ def settled_scenes(key: jax.Array, engine: Engine, config: scenes.SceneConfig, c
 
 
 def grasp_away(
-    engine: Engine, scene: Scene, poses: Array, grasps: Grasp
-) -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
+    engine: Engine, scene: Scene, poses: Float[Array, "B N 7"], grasps: Grasp
+) -> tuple[Scene, Float[np.ndarray, "B N 7"], Bool[np.ndarray, "B N"], Int[np.ndarray, " B"]]:
     """Execute one grasp a scene, take away what is held, let the rest come to rest.
 
     Args:
       engine: physics.
-      scene: `[B, N]`.
-      poses: `[B, N, 7]`.
-      grasps: `[B]`.
+      scene: B scenes.
+      poses: of their objects, before.
+      grasps: one a scene.
 
     Returns:
-      Scenes and poses `[B, N, 7]` afterwards, objects held `[B, N]` bool, and faults `[B]` of both simulations.
+      Scenes and poses afterwards, which objects were held, and faults of both simulations.
     """
     rollout, outcome = primitives.grasp(engine, scene, poses, grasps)
     held = np.asarray(outcome.held)
@@ -87,5 +88,5 @@ def grasp_away(
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _random_scenes(keys: jax.Array, config: scenes.SceneConfig) -> tuple[Scene, jax.Array]:
+def _random_scenes(keys: Key[Array, " B"], config: scenes.SceneConfig) -> tuple[Scene, Float[jax.Array, "B N 7"]]:
     return jax.vmap(lambda k: scenes.random_scene(k, config=config))(keys)

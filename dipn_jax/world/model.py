@@ -8,6 +8,7 @@ traces geometry (MJX) replaces its vertices, and compiles once for all scenes.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from dipn_jax.engine import PhysicsConfig
 from dipn_jax.structs import Scene
@@ -91,8 +92,8 @@ def _object(scene: Scene, slot: int, generic: bool, inertia: np.ndarray) -> tupl
     return f'<body name="o{slot}"><freejoint name="o{slot}"/>{inertial}{"".join(geoms)}</body>', "".join(assets)
 
 
-def inertias(scene: Scene) -> np.ndarray:
-    """Diagonal inertia `[N, 3]`; that of a harmless ball for empty slots."""
+def inertias(scene: Scene) -> Float[np.ndarray, "*b N 3"]:
+    """Diagonal inertia (kg m^2); that of a harmless ball for empty slots."""
     spread = shapes.UNIT_VARIANCE[np.maximum(scene.shape, 0)] * np.asarray(scene.size, float) ** 2
     inertia = np.asarray(scene.mass, float)[:, None] * (spread.sum(-1, keepdims=True) - spread)
     return np.where((np.asarray(scene.shape) >= 0)[:, None], inertia, 1e-4)

@@ -7,8 +7,10 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int, Key
 
 from dipn_jax import geometry
+from dipn_jax.structs import Array
 from dipn_jax.world import shapes
 
 ROWS = 3
@@ -23,8 +25,8 @@ DROPPED = 0.3
 """Share of scenes whose last object falls onto or beside the others."""
 
 
-def _quarter_turns() -> np.ndarray:
-    """Quaternions `[24, 4]` (wxyz) of the rotations that map a cube onto itself."""
+def _quarter_turns() -> Float[np.ndarray, "24 4"]:
+    """Quaternions (wxyz) of the rotations that map a cube onto itself."""
     whole = [np.array(v, float) for v in itertools.product((0, 1, -1), repeat=4) if np.abs(v).sum() in (1, 2, 4)]
     first = [v / np.linalg.norm(v) for v in whole if v[np.flatnonzero(v)[0]] > 0]  # q and -q are one rotation
     return np.unique(np.round(first, 12), axis=0).astype(np.float32)
@@ -33,17 +35,19 @@ def _quarter_turns() -> np.ndarray:
 QUARTER_TURNS = _quarter_turns()
 
 
-def pack(key: jax.Array, shape: jax.Array, size: jax.Array, present: jax.Array) -> jax.Array:
+def pack(
+    key: Key[Array, ""], shape: Int[Array, " N"], size: Float[Array, "N 3"], present: Bool[Array, " N"]
+) -> Float[jax.Array, "N 7"]:
     """Objects side by side in up to ROWS rows, each on one of its faces, all turned by the same angle.
 
     Args:
       key: random key.
-      shape: `[N]` int32, index into `shapes.CLASSES`; ABSENT where there is none.
-      size: `[N, 3]` metres.
-      present: `[N]` bool.
+      shape: index into `shapes.CLASSES`; ABSENT where there is none.
+      size: metres.
+      present: which slots hold an object.
 
     Returns:
-      Poses `[N, 7]`, a millimetre above the table; in a share of scenes the last object is 0.2 m up, anyhow turned.
+      Poses, a millimetre above the table; in a share of scenes the last object is 0.2 m up, anyhow turned.
     """
     n = shape.shape[0]
     keys = jax.random.split(key, 8)
@@ -70,7 +74,7 @@ def pack(key: jax.Array, shape: jax.Array, size: jax.Array, present: jax.Array) 
     falls = jax.random.bernoulli(keys[6], DROPPED) & (jnp.arange(n) == present.sum() - 1)
     spot = jax.random.uniform(keys[7], (2,), minval=-0.1, maxval=0.1)
     center = jnp.where(falls[:, None], jnp.append(spot, 0.2), center)
-    tumbled: jax.Array = geometry.random_quat(keys[6], shape=(n,))
+    tumbled = geometry.random_quat(keys[6], shape=(n,))
     quat = jnp.where(falls[:, None], tumbled, quat)
     offset = jnp.asarray(shapes.UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(shape, 0)] * size
     mass_center = center + jnp.einsum("nij,nj->ni", geometry.quat_to_matrix(quat), offset)

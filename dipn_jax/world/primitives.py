@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from dipn_jax import geometry
 from dipn_jax.engine import Engine
@@ -31,14 +32,16 @@ TIPPED = np.deg2rad(45)
 HELD_RISE = 0.5  # of the lift: an object that rose by more is held
 
 
-def _frames(times: Sequence[float | jax.Array], targets: list[jax.Array]) -> Trajectory:
-    """Key frames from durations (seconds `[...]`, first 0) and targets `[..., 5]`."""
+def _frames(times: Sequence[Float[Array, "*b"] | float], targets: list[Float[jax.Array, "*b 5"]]) -> Trajectory:
+    """Key frames from durations (seconds, first 0) and targets."""
     target = jnp.stack(targets, -2)
     lasting = [jnp.broadcast_to(jnp.asarray(t, jnp.float32), target.shape[:-2]) for t in times]
     return Trajectory(jnp.cumsum(jnp.stack(lasting, -1), -1), target)
 
 
-def _pose(xy: Array, height: Array, yaw: Array, gap: float) -> jax.Array:
+def _pose(
+    xy: Float[Array, "*b 2"], height: Float[Array, "*#b"] | float, yaw: Float[Array, "*#b"] | float, gap: float
+) -> Float[jax.Array, "*b 5"]:
     xy = jnp.asarray(xy, jnp.float32)
     height, yaw, gap_ = jnp.broadcast_arrays(jnp.asarray(height), jnp.asarray(yaw), jnp.float32(gap))
     height, yaw, gap_ = (jnp.broadcast_to(v, xy.shape[:-1]) for v in (height, yaw, gap_))
@@ -64,8 +67,8 @@ def push_trajectory(push: Push) -> Trajectory:
     return _frames(times, [start_high, start_low, start_low, end_low, end_low, end_high, end_high])
 
 
-def push_samples(*, longest: float = PUSH_STEPS * 0.01) -> np.ndarray:
-    """Seconds `[12]`: at each centimetre of travel to 10, and at rest after `longest` metres."""
+def push_samples(*, longest: float = PUSH_STEPS * 0.01) -> Float[np.ndarray, " 12"]:
+    """Seconds: at each centimetre of travel to 10, and at rest after `longest` metres."""
     begin = DESCEND_TIME + 0.1
     travel = begin + np.arange(PUSH_STEPS + 1) * 0.01 / PUSH_SPEED
     return np.append(travel, begin + longest / PUSH_SPEED + 0.1 + DESCEND_TIME + REST_TIME)
@@ -82,36 +85,43 @@ def grasp_trajectory(grasp: Grasp) -> Trajectory:
     return _frames(times, [high, low_open, low_open, low_shut, low_shut, top_shut, top_shut])
 
 
-def grasp_samples() -> np.ndarray:
-    """Seconds `[2]`: at the start, and at the end of the lift. Multiples of the control period."""
+def grasp_samples() -> Float[np.ndarray, " 2"]:
+    """Seconds: at the start, and at the end of the lift. Multiples of the control period."""
     end = REACH_TIME + 0.05 + GRIPPER.stroke / 2 / CLOSE_SPEED + HOLD_TIME + LIFT_TIME + REST_TIME
     return np.array([0.0, np.ceil(end * 100) / 100])
 
 
 def settle(
-    engine: Engine, scenes: Scene, poses: Array, *, duration: float = SETTLE_TIME, fence: float = 0.0
+    engine: Engine, scenes: Scene, poses: Float[Array, "B N 7"], *, duration: float = SETTLE_TIME, fence: float = 0.0
 ) -> Rollout:
-    """Let the scenes `[B, N]` come to rest; `poses [B, 1, N, 7]`. `fence`: see `Engine.simulate`."""
+    """Let the scenes come to rest; one sample, at the end. `fence`: see `Engine.simulate`."""
     batch = len(np.asarray(scenes.shape))
     still, end = parked_trajectory(batch, duration), np.array([duration])
     return engine.simulate(scenes, poses, still, end, settle=True, fence=fence)
 
 
-def push(engine: Engine, scenes: Scene, poses: Array, pushes: Push, *, longest: float = PUSH_STEPS * 0.01) -> Rollout:
-    """Execute one push of at most `longest` metres a scene; `poses [B, 12, N, 7]`: at each centimetre, and at rest."""
+def push(
+    engine: Engine,
+    scenes: Scene,
+    poses: Float[Array, "B N 7"],
+    pushes: Push,
+    *,
+    longest: float = PUSH_STEPS * 0.01,
+) -> Rollout:
+    """Execute one push of at most `longest` metres a scene; 12 samples: at each centimetre, and at rest."""
     rollout = engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(longest=longest), settle=True)
     over = tipped(rollout.poses[..., 0, :, 3:], rollout.poses[..., -1, :, 3:]) & (scenes.shape >= 0)
     return rollout.replace(fault=rollout.fault | jnp.where(over.any(-1), Fault.TIPPED, 0))
 
 
-def tipped(before: Array, after: Array) -> jax.Array:
-    """Which objects with quaternions `[..., 4]` (wxyz) have another side up, by over 45 degrees."""
+def tipped(before: Float[Array, "*b 4"], after: Float[Array, "*b 4"]) -> Bool[jax.Array, "*b"]:
+    """Which objects with quaternions (wxyz) have another side up, by over 45 degrees."""
     up = [geometry.quat_to_matrix(jnp.asarray(quat))[..., 2, :] for quat in (before, after)]
     return (up[0] * up[1]).sum(-1) < np.cos(TIPPED)
 
 
-def grasp(engine: Engine, scenes: Scene, poses: Array, grasps: Grasp) -> tuple[Rollout, Outcome]:
-    """Execute one grasp a scene; `poses [B, 2, N, 7]`: before, and after the lift."""
+def grasp(engine: Engine, scenes: Scene, poses: Float[Array, "B N 7"], grasps: Grasp) -> tuple[Rollout, Outcome]:
+    """Execute one grasp a scene; two samples: before, and after the lift."""
     rollout = engine.simulate(scenes, poses, grasp_trajectory(grasps), grasp_samples())
     return rollout, grasp_outcome(scenes, rollout)
 
@@ -120,4 +130,4 @@ def grasp_outcome(scenes: Scene, rollout: Rollout) -> Outcome:
     """Which objects rose with the hand between the first and the last sample."""
     rise = rollout.poses[..., -1, :, 2] - rollout.poses[..., 0, :, 2]
     held = (scenes.shape >= 0) & (rise > HELD_RISE * GRIPPER.lift)
-    return Outcome(held, held.any(-1))
+    return Outcome(held, held.any(-1))  # type: ignore[arg-type]  # an np.bool where there is no batch axis

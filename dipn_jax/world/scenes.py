@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Key
 
 from dipn_jax import geometry
 from dipn_jax.errors import UserError
@@ -84,7 +85,7 @@ def parse_objects(text: str, *, ranges: Ranges = DEFAULT_RANGES) -> SceneConfig:
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Array]:
+def random_scene(key: Key[Array, ""], *, config: SceneConfig) -> tuple[Scene, Float[jax.Array, "{config.slots} 7"]]:
     """Random objects in mid-air, none touching another; or packed (`Ranges.packed`).
 
     Args:
@@ -92,7 +93,7 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
       config: distributions.
 
     Returns:
-      The scene, and poses `[N, 7]`: random positions and orientations, each object just above the
+      The scene, and poses: random positions and orientations, each object just above the
       bounding spheres of those before it, or rows of `packing`. Empty slots are parked outside the workspace.
     """
     n, ranges = config.slots, config.ranges
@@ -126,8 +127,8 @@ def random_scene(key: jax.Array, *, config: SceneConfig) -> tuple[Scene, jax.Arr
     return Scene(shape.astype(jnp.int32), size, color, mass, friction), poses
 
 
-def _allowed(size: jax.Array) -> jax.Array:
-    """Sizes `[N, 3]` with no side under MIN_SIDE and the longest cut where the diagonal is over MAX_DIAGONAL."""
+def _allowed(size: Float[Array, "N 3"]) -> Float[jax.Array, "N 3"]:
+    """Sizes with no side under MIN_SIDE and the longest cut where the diagonal is over MAX_DIAGONAL."""
     size = jnp.maximum(size, MIN_SIDE)
     longest = jnp.arange(3) == size.argmax(-1, keepdims=True)
     others = jnp.where(longest, 0.0, size**2).sum(-1, keepdims=True)
@@ -135,8 +136,10 @@ def _allowed(size: jax.Array) -> jax.Array:
     return jnp.where(longest, jnp.minimum(size, limit), size)
 
 
-def _stack_heights(xy: jax.Array, radius: jax.Array, present: jax.Array) -> jax.Array:
-    """Lowest heights `[N]` at which spheres of `radius [N]` over `xy [N, 2]` do not overlap, placed in order."""
+def _stack_heights(
+    xy: Float[Array, "N 2"], radius: Float[Array, " N"], present: Bool[Array, " N"]
+) -> Float[jax.Array, " N"]:
+    """Lowest heights at which spheres of `radius` over `xy` do not overlap, placed in order."""
 
     def place(heights: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
         gap = (xy - xy[i]) ** 2
@@ -149,21 +152,23 @@ def _stack_heights(xy: jax.Array, radius: jax.Array, present: jax.Array) -> jax.
     return heights
 
 
-def parked(n: int) -> jax.Array:
-    """Poses `[N, 7]` of empty slots: far outside the workspace, apart from one another."""
+def parked(n: int) -> Float[jax.Array, "{n} 7"]:
+    """Poses of empty slots: far outside the workspace, apart from one another."""
     x = 5.0 + 0.5 * jnp.arange(n, dtype=jnp.float32)
     zero, one = jnp.zeros(n), jnp.ones(n)
     return jnp.stack([x, zero + 5.0, zero + 1.0, one, zero, zero, zero], -1)
 
 
-def remove(scene: Scene, poses: Array, gone: Array) -> tuple[Scene, jax.Array]:
-    """Scenes `[..., N]` and poses `[..., N, 7]` without the objects `gone [..., N]`, which are parked."""
+def remove(
+    scene: Scene, poses: Float[Array, "*b N 7"], gone: Bool[Array, "*b N"]
+) -> tuple[Scene, Float[jax.Array, "*b N 7"]]:
+    """Scenes and poses without the objects `gone`, which are parked."""
     shape = jnp.where(gone, ABSENT, scene.shape)
     return scene.replace(shape=shape), jnp.where(gone[..., None], parked(gone.shape[-1]), poses)
 
 
 def nominal(scene: Scene) -> Scene:
-    """Scenes `[..., N]` as one who sees only shapes would guess them: density 500 kg/m^3, friction 0.35."""
+    """Scenes as one who sees only shapes would guess them: density 500 kg/m^3, friction 0.35."""
     shape = np.asarray(scene.shape)
     mass = np.where(shape >= 0, NOMINAL_DENSITY * shapes.volume(shape, np.asarray(scene.size)), 0.1)
     friction = np.full(shape.shape, NOMINAL_FRICTION, np.float32)

@@ -18,6 +18,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from dipn_jax.structs import Array, Pytree
 
@@ -165,20 +166,20 @@ MAX_DIAGONAL = 0.126
 
 @flax.struct.dataclass
 class Hull(Pytree):
-    """The convex parts of one object, in the object's own frame."""
+    """The convex parts of one object, in the object's own frame; V is 2 CORNERS, F is CORNERS + 2."""
 
-    vertices: jax.Array  # [P, 2K, 3] metres: lower ring, upper ring, counter-clockwise about the axis
-    normals: jax.Array  # [P, K + 2, 3] outward unit normals: sides, lower cap, upper cap
-    offsets: jax.Array  # [P, K + 2] metres: a point x is inside where normals @ x <= offsets
-    alive: jax.Array  # [P] bool
+    vertices: Float[Array, "*b P V 3"]  # metres: lower ring, upper ring, counter-clockwise about the axis
+    normals: Float[Array, "*b P F 3"]  # outward unit normals: sides, lower cap, upper cap
+    offsets: Float[Array, "*b P F"]  # metres: a point x is inside where normals @ x <= offsets
+    alive: Bool[Array, "*b P"]  # whether there is such a part
 
 
-def hull(shape: Array, size: Array) -> Hull:
+def hull(shape: Int[Array, ""] | int, size: Float[Array, " 3"]) -> Hull:
     """The parts of an object.
 
     Args:
-      shape: `[]` int, index into CLASSES; a negative one gives no part.
-      size: `[3]` metres, bounding box.
+      shape: index into CLASSES; a negative one gives no part.
+      size: metres, bounding box.
     """
     index = jnp.maximum(shape, 0)
     vertices = jnp.asarray(UNIT_VERTICES, jnp.float32)[index] * size
@@ -199,13 +200,15 @@ def hull(shape: Array, size: Array) -> Hull:
     return Hull(vertices, normals, offsets, alive)
 
 
-def volume(shape: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Volume `[...]` in cubic metres of shapes `[...]` with bounding boxes `[..., 3]`."""
+def volume(shape: Int[Array, "*b"], size: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
+    """Volume in cubic metres of shapes with bounding boxes of `size` metres."""
     return UNIT_VOLUME[np.maximum(shape, 0)] * np.prod(size, axis=-1)
 
 
-def inertia(shape: jax.Array, size: jax.Array, mass: jax.Array) -> jax.Array:
-    """Diagonal inertia `[3]` (kg m^2) about the centre of mass.
+def inertia(
+    shape: Int[Array, ""] | int, size: Float[Array, " 3"], mass: Float[Array, ""] | float
+) -> Float[Array, " 3"]:
+    """Diagonal inertia (kg m^2) about the centre of mass.
 
     Every class has two planes of symmetry, so its inertia is diagonal in its own axes.
     """
@@ -213,14 +216,16 @@ def inertia(shape: jax.Array, size: jax.Array, mass: jax.Array) -> jax.Array:
     return mass * (spread.sum() - spread)
 
 
-def radius(shape: jax.Array, size: jax.Array) -> jax.Array:
-    """Radius `[...]` (metres) of a ball about the centre of mass that holds the object."""
+def radius(shape: Int[Array, "*b"], size: Float[Array, "*b 3"]) -> Float[jax.Array, "*b"]:
+    """Radius (metres) of a ball about the centre of mass that holds the object."""
     offset = jnp.asarray(UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(shape, 0)] * size
     return jnp.linalg.norm(size, axis=-1) / 2 + jnp.linalg.norm(offset, axis=-1)
 
 
-def lowest_corner(shape: Array, size: Array, poses: Array, *, xp: Any = jnp) -> Array:
-    """Height `[...]` (metres) of the lowest corner of objects `shape [...]`, `size [..., 3]`, `poses [..., 7]`.
+def lowest_corner(
+    shape: Int[Array, "*b"], size: Float[Array, "*b 3"], poses: Float[Array, "*b 7"], *, xp: Any = jnp
+) -> Float[Array, "*b"]:
+    """Height (metres) of the lowest corner of objects.
 
     `xp` is `jax.numpy`, or `numpy` where the number of objects changes from call to call.
     """

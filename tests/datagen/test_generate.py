@@ -9,7 +9,7 @@ from dipn_jax.datagen.generate import Job, generate
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
-from dipn_jax.storage import records
+from dipn_jax.storage import records, shards
 from dipn_jax.world import scenes
 
 JOB = Job("push", scenes.fixed_count(3, spread=0.2), 24, 0, 16, 4, "native", None)
@@ -41,11 +41,11 @@ def test_a_shard_is_the_same_by_another_worker(copy: pathlib.Path, tmp_path: pat
     other = tmp_path / "other"
     generate(JOB, other, part=1, of=2)
     assert sorted(p.name for p in other.glob("*.parquet")) == ["shard-00001.parquet"]
-    assert records.shard_path(other, 1).read_bytes() == records.shard_path(copy, 1).read_bytes()
+    assert shards.shard_path(other, 1).read_bytes() == shards.shard_path(copy, 1).read_bytes()
 
 
 def test_a_gap_is_filled_with_the_same_bytes_and_the_rest_left_alone(copy: pathlib.Path) -> None:
-    first, second = records.shard_path(copy, 0), records.shard_path(copy, 1)
+    first, second = shards.shard_path(copy, 0), shards.shard_path(copy, 1)
     wanted, untouched = second.read_bytes(), first.stat().st_mtime_ns
     second.unlink()
     generate(JOB, copy)
@@ -58,7 +58,7 @@ def test_an_interruption_loses_at_most_the_shards_at_hand(
     copy: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "new"
-    original = records.write_shard
+    original = shards.write_shard
     job = dataclasses.replace(JOB, episodes=33)
 
     def die_at_third(folder: pathlib.Path, index: int, *args: object, **options: object) -> None:
@@ -66,7 +66,7 @@ def test_an_interruption_loses_at_most_the_shards_at_hand(
             raise KeyboardInterrupt
         original(folder, index, *args, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(records, "write_shard", die_at_third)
+    monkeypatch.setattr(shards, "write_shard", die_at_third)
     with pytest.raises(KeyboardInterrupt):
         generate(job, out)
     monkeypatch.undo()
@@ -74,7 +74,7 @@ def test_an_interruption_loses_at_most_the_shards_at_hand(
     generate(job, out)
     assert records.verify(out) == [] and len(records.load(out, kind="push")[0].fault) == 33
     for index in (0,):  # the second is longer here
-        assert records.shard_path(out, index).read_bytes() == records.shard_path(copy, index).read_bytes()
+        assert shards.shard_path(out, index).read_bytes() == shards.shard_path(copy, index).read_bytes()
 
 
 def test_another_config_in_the_same_folder_is_refused(copy: pathlib.Path) -> None:
@@ -98,7 +98,7 @@ def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
 
 def test_a_shard_does_not_depend_on_how_many_others_there_are(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
     generate(dataclasses.replace(JOB, episodes=16), tmp_path / "short")
-    assert records.shard_path(tmp_path / "short", 0).read_bytes() == records.shard_path(copy, 0).read_bytes()
+    assert shards.shard_path(tmp_path / "short", 0).read_bytes() == shards.shard_path(copy, 0).read_bytes()
 
 
 def test_every_distance_is_a_push_of_its_own_from_the_same_scene(tmp_path: pathlib.Path) -> None:

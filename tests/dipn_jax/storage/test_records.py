@@ -7,7 +7,7 @@ import pytest
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import records
+from dipn_jax.storage import records, shards
 
 
 @pytest.fixture
@@ -16,9 +16,9 @@ def copy(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> pathlib.Path:
 
 
 def test_what_is_read_is_what_was_written(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    episodes = records.read_shard(records.shard_path(copy, 0), kind="push")
-    records.write_shard(tmp_path, 3, episodes, kind="push", config={"seed": 0}, faults={})
-    again = records.read_shard(records.shard_path(tmp_path, 3), kind="push")
+    episodes = shards.read_shard(shards.shard_path(copy, 0), kind="push")
+    shards.write_shard(tmp_path, 3, episodes, kind="push", config={"seed": 0}, faults={})
+    again = shards.read_shard(shards.shard_path(tmp_path, 3), kind="push")
     for name in ("poses", "after", "fault"):
         np.testing.assert_array_equal(getattr(again, name), getattr(episodes, name))
     np.testing.assert_array_equal(again.scene.size, episodes.scene.size)
@@ -36,13 +36,13 @@ def test_a_data_set_says_what_made_it(copy: pathlib.Path) -> None:
 def test_any_tool_opens_a_shard(copy: pathlib.Path) -> None:
     import pyarrow.parquet
 
-    table = pyarrow.parquet.read_table(records.shard_path(copy, 0))
+    table = pyarrow.parquet.read_table(shards.shard_path(copy, 0))
     assert "scene.shape" in table.column_names and "push.angle" in table.column_names
 
 
 @pytest.mark.parametrize("damage", ["truncate", "empty", "flip", "delete", "foreign"])
 def test_a_damaged_shard_is_named_and_repaired(copy: pathlib.Path, damage: str) -> None:
-    path = records.shard_path(copy, 1)
+    path = shards.shard_path(copy, 1)
     content = path.read_bytes()
     if damage == "truncate":
         path.write_bytes(content[: len(content) // 2])
@@ -74,12 +74,12 @@ def test_the_wrong_kind_a_missing_and_an_old_data_set_are_named(copy: pathlib.Pa
 
 
 def test_another_schema_version_is_named(copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(records, "SCHEMA_VERSION", 99)
+    monkeypatch.setattr(shards, "SCHEMA_VERSION", 99)
     with pytest.raises(UserError, match="schema version 2, want 99"):
-        records.read_shard(records.shard_path(copy, 0), kind="push")
+        shards.read_shard(shards.shard_path(copy, 0), kind="push")
     with pytest.raises(UserError, match="schema version 2, want 99"):
         records.repair(copy)
-    assert records.shard_path(copy, 0).exists(), "what is only old is not set aside"
+    assert shards.shard_path(copy, 0).exists(), "what is only old is not set aside"
 
 
 def test_a_folder_that_is_no_data_set_is_left_alone(tmp_path: pathlib.Path) -> None:
@@ -92,7 +92,7 @@ def test_a_folder_that_is_no_data_set_is_left_alone(tmp_path: pathlib.Path) -> N
 def test_the_fingerprint_follows_the_content(copy: pathlib.Path) -> None:
     before = records.load(copy, kind="push")[1]
     assert records.load(copy, kind="push")[1] == before
-    records.shard_path(copy, 1).unlink()
+    shards.shard_path(copy, 1).unlink()
     records.update_manifest(copy)
     assert records.load(copy, kind="push")[1] != before
 
