@@ -220,14 +220,14 @@ def mirror_motion(motion: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     return motion * jnp.array([1.0, -1.0, -1.0])
 
 
-def to_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
+def to_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*#b"]) -> Float[jax.Array, "*b N 3"]:
     """Motions (pixels, degrees, push frame) in metres and radians, workspace; `angle` in radians."""
     metric = motion / losses.PIXELS_DEGREES
     shift = geometry.rotate2d(metric[..., :2], angle[..., None])
     return jnp.concatenate([shift, metric[..., 2:]], -1)
 
 
-def from_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
+def from_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*#b"]) -> Float[jax.Array, "*b N 3"]:
     """Inverse of `to_workspace`."""
     shift = geometry.rotate2d(motion[..., :2], -angle[..., None])
     return jnp.concatenate([shift, motion[..., 2:]], -1) * losses.PIXELS_DEGREES
