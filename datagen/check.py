@@ -207,7 +207,7 @@ def _camera_parts(cells: _Cells) -> list[str]:
         "## Camera against MuJoCo's ray caster",
         f"{cells.number('camera/scenes', '.0f')} scenes of ten objects: labels equal on "
         f"{cells.number('camera/labels_equal', '.4%').replace('%', ' %')} of pixels; heights there within 0.1 mm "
-        f"but for {cells.number('camera/heights_apart', '.0f')} on edges (largest "
+        f"but for {cells.number('camera/heights_apart', '.0f')} on edges (largest\n"
         f"{cells.number('camera/height_max_mm', '.2f')} mm).",
     ]
 

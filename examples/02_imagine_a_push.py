@@ -17,7 +17,7 @@ observation = dipn_jax.render(scene[0], rest[0])
 
 # four pushes of 10 cm, and how DIPN thinks that each moves every object: [4, N, 3] metres, metres, radians
 pushes, feasible = candidates.sample_pushes(jax.random.key(3), observation, count=4, distance=0.1)
-predict = predictors.load_predictor("builtin")
+predict = jax.jit(predictors.load_predictor("builtin"))
 motion = predict(observation, pushes)
 
 # the first push: every object's pixels moved, against the simulation

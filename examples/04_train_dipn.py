@@ -4,6 +4,7 @@ import json
 import pathlib
 import tempfile
 
+import jax
 from dipn_jax.datagen import cli as datagen
 from dipn_jax.train import cli as train
 from dipn_jax.train.configs import TrainConfig
@@ -24,6 +25,6 @@ for point in curve:
 
 episode = dipn_jax.read_episodes(folder / "data")[0]
 observation = dipn_jax.render(episode.scene, episode.poses[0])
-predict = predictors.load_predictor(folder / "run")
+predict = jax.jit(predictors.load_predictor(folder / "run"))
 motion = predict(observation, episode.push[None])
 print("predicted motion (m, m, rad) of each object:", motion[0].round(3))

@@ -187,6 +187,8 @@ def test_the_commands_of_the_tutorial_work_at_small_scale(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(moving_picture, "PERIOD", 0.5)
+    monkeypatch.setattr(moving_picture, "HOLD", 2)
     for words in commands(ROOT / "docs" / "tutorial.md"):
         if words[0] == "python":
             moving_picture.main(pathlib.Path("results/picture"), pathlib.Path("results/clearing.gif"))

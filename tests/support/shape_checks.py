@@ -1,12 +1,13 @@
 """The type checker that the import hook puts on every function of the library in tests: beartype, for shapes alone.
 
 Only annotations that say a shape are looked at (`Float[Array, "N 3"]`, or a struct that has such fields); what else a
-function is given, the tests of its errors decide. Two things that beartype alone does not do:
+function is given, mypy and the tests of its errors see to. Three things that beartype alone does not do:
 
 - an axis of a field is the same as the axis of that name in the other arguments: a scene of five objects with poses of
   six is an error. Leading batch axes (`*b`) belong to one struct;
 - JAX rebuilds structs around leaves that are not arrays (`None`, `object()`, shapes, axes of `vmap`), so a field is
-  checked only where it holds an array.
+  checked only where it holds an array;
+- an array of NumPy does where one of JAX is wanted, and the other way round, as in JAX.
 """
 
 from __future__ import annotations
@@ -25,23 +26,25 @@ import jax
 import jaxtyping
 import numpy as np
 
-ARRAYS = (jax.Array, np.ndarray, np.generic)
 
-
-class _Other(type):
+class _Kind(type):
     def __instancecheck__(cls, value: object) -> bool:
-        return not isinstance(value, ARRAYS)
+        return isinstance(value, (jax.Array, np.ndarray, np.generic)) == (cls is AnArray)
 
 
-class NoArray(metaclass=_Other):
-    """Anything that is not an array."""
+class AnArray(metaclass=_Kind):
+    """Any array, of JAX or of NumPy."""
+
+
+class NoArray(metaclass=_Kind):
+    """Anything else."""
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` with the shapes of its arguments and of its result checked on every call."""
     hints = function.__annotations__
     structs = [name for name, hint in hints.items() if name != "return" and any(map(_is_struct, _parts(hint)))]
-    shaped = {name: hint for name, hint in hints.items() if _says_shape(hint)}
+    shaped = {name: _of_any_array(hint) for name, hint in hints.items() if _says_shape(hint)}
     if function.__name__ == "__init__":
         shaped, structs = {name: hint | NoArray for name, hint in shaped.items()}, []
     if not shaped and not structs:
@@ -67,7 +70,7 @@ def _check_fields(struct: Any, place: str) -> None:
     for name, hint in _fields(type(struct)):
         value, where = getattr(struct, name), f"{place}.{name}"
         _check_fields(value, where)
-        if isinstance(value, ARRAYS) and _says_shape(hint) and not any(isinstance(value, p) for p in _parts(hint)):
+        if isinstance(value, AnArray) and _says_shape(hint) and not any(isinstance(value, p) for p in _parts(hint)):
             raise TypeError(f"{where} {value.dtype}{list(value.shape)}: want {hint}")
 
 
@@ -75,14 +78,19 @@ def _check_fields(struct: Any, place: str) -> None:
 def _fields(struct: type) -> list[tuple[str, Any]]:
     """Fields and their types, any batch axes allowed."""
     hints = typing.get_type_hints(struct, include_extras=True)
-    return [(field.name, _without_batch(hints[field.name])) for field in dataclasses.fields(struct)]
+    return [(field.name, _of_any_array(hints[field.name], batch="...")) for field in dataclasses.fields(struct)]
 
 
-def _without_batch(hint: Any) -> Any:
+def _of_any_array(hint: Any, *, batch: str = "*b") -> Any:
+    """The same type for arrays of any kind, with `batch` for the batch axes."""
+    if _is_array(hint):
+        return hint.dtype[AnArray, hint.dim_str.replace("*b", batch)]
     if not _says_shape(hint):
         return hint
-    parts = [p.dtype[p.array_type, p.dim_str.replace("*b", "...")] if _is_array(p) else p for p in _parts(hint)]
-    return functools.reduce(operator.or_, parts)
+    arguments = [_of_any_array(part, batch=batch) for part in typing.get_args(hint) if part is not np.generic]
+    if len(_parts(hint)) > 1:
+        return functools.reduce(operator.or_, arguments)
+    return typing.get_origin(hint)[tuple(arguments)]
 
 
 def _parts(hint: Any) -> tuple[Any, ...]:
