@@ -225,7 +225,7 @@ def mirror_motion(motion: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     return motion * jnp.array([1.0, -1.0, -1.0])
 
 
-def to_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
+def to_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*#b"]) -> Float[jax.Array, "*b N 3"]:
     """Turn network output (pixels, degrees, push frame) into metres and radians, workspace.
 
     `angle` is the direction of the push, in radians.
@@ -235,7 +235,7 @@ def to_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> F
     return jnp.concatenate([shift, metric[..., 2:]], -1)
 
 
-def from_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*b"]) -> Float[jax.Array, "*b N 3"]:
+def from_workspace(motion: Float[Array, "*b N 3"], angle: Float[Array, "*#b"]) -> Float[jax.Array, "*b N 3"]:
     """Return the inverse of `to_workspace`."""
     shift = geometry.rotate2d(motion[..., :2], -angle[..., None])
     return jnp.concatenate([shift, motion[..., 2:]], -1) * losses.PIXELS_DEGREES
