@@ -63,7 +63,7 @@ def push(
       dipn-datagen push --out data/push --episodes 1500
 
     The same pushes at three distances, each ended by its own retreat:
-      dipn-datagen push --out data/sweep --distances 0.03 0.06 0.1
+      dipn-datagen push --out data/sweep --distances 0.03 0.06 0.1 --shard-size 300
 
     Args:
       out: folder of the data set; asking again continues or extends it.

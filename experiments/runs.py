@@ -221,14 +221,14 @@ def parse(run: Run) -> dict[str, Any]:
     if program not in PROGRAMS:
         return {}
     found: dict[str, Any] = {}
-    command = importlib.import_module(PROGRAMS[program]).COMMANDS[arguments[0]]
+    commands = importlib.import_module(PROGRAMS[program]).COMMANDS
 
-    @functools.wraps(command)
+    @functools.wraps(commands[arguments[0]])
     def collect(**values: Any) -> None:
         found.update(values)
 
     try:
-        console.run(program, {arguments[0]: collect}, arguments)
+        console.run(program, {**commands, arguments[0]: collect}, arguments)
     except SystemExit:
         raise UserError(f"{run.name}: {program} does not take these arguments: {run.line}") from None
     return found

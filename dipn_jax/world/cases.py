@@ -23,7 +23,9 @@ def hard_cases_path() -> pathlib.Path:
     return pathlib.Path(__file__).parents[1] / "data" / "hard_cases.json"
 
 
-def load_cases(path: pathlib.Path, *, slots: int | None = None) -> tuple[list[str], Scene, Float[np.ndarray, "C N 7"]]:
+def load_cases(
+    path: pathlib.Path | str | None = None, *, slots: int | None = None
+) -> tuple[list[str], Scene, Float[np.ndarray, "C N 7"]]:
     """Read a case file: hand-placed scenes in the format of `hard_cases.json`.
 
         names, scenes, poses = dipn_jax.load_cases()             # the ten hard tables

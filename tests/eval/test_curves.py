@@ -1,6 +1,5 @@
 """Learning curves: which run is which, the arithmetic of the band, and the page in docs."""
 
-import importlib.util
 import json
 import pathlib
 
@@ -58,16 +57,6 @@ def test_the_table_has_a_row_for_each_predictor() -> None:
     assert rows[4:] == ["| `trans` | 0.600 | 0.600 |"]
 
 
-def test_the_page_of_push_prediction_shows_the_figures_in_docs() -> None:
-    place = importlib.util.spec_from_file_location("push_prediction", DOCS / "push_prediction.py")
-    assert place is not None and place.loader is not None
-    page = importlib.util.module_from_spec(place)
-    place.loader.exec_module(page)
-    text = (DOCS / "push-prediction.md").read_text()
-    for table in page.tables(json.loads((DOCS / "push-prediction.json").read_text())):
-        assert table in text
-
-
 def _grasp_run(folder: pathlib.Path, pretrained: bool, success: list[float]) -> pathlib.Path:
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps({"pretrained": pretrained}))
@@ -94,13 +83,3 @@ def test_another_run_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(UserError, match="no run of dipn-train grasp-online"):
         curves.load_grasp_runs([tmp_path])
-
-
-def test_the_page_of_grasping_shows_the_figures_in_docs() -> None:
-    place = importlib.util.spec_from_file_location("grasping_page", DOCS / "grasping.py")
-    assert place is not None and place.loader is not None
-    page = importlib.util.module_from_spec(place)
-    place.loader.exec_module(page)
-    text = (DOCS / "grasping.md").read_text()
-    for table in page.tables(json.loads((DOCS / "grasping.json").read_text())):
-        assert table in text
