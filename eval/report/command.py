@@ -33,5 +33,6 @@ def report(
     console.require_out(out)
     from . import page
 
-    values = page.write(out, prediction=predictions, grasp=grasps, clears=list(clears), sweep=sweeps, runs=list(runs))
+    sources = page.Sources(prediction=predictions, grasp=grasps, clears=clears, sweep=sweeps, runs=runs)
+    values = page.write(out, sources)
     console.say(f"{out / 'report.html'}: {len(values)} numbers, also in {out / 'metrics.json'}")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
 import json
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -26,54 +28,24 @@ table{border-collapse:collapse;margin:1em 0}td,th{padding:.25em .8em;border-bott
 td:first-child,th:first-child{text-align:left}img{max-width:100%}h2{margin-top:2em}.note{color:#666}"""
 
 
-def write(
-    out: pathlib.Path,
-    *,
-    prediction: pathlib.Path | None,
-    grasp: pathlib.Path | None,
-    clears: list[pathlib.Path],
-    sweep: pathlib.Path | None,
-    runs: list[pathlib.Path],
-) -> dict[str, Any]:
-    """Read everything, then write `report.html`, its pictures and `metrics.json`; returns the merged metrics.
+@dataclasses.dataclass(frozen=True)
+class Sources:
+    """The folders that a report is made of."""
 
-    Args:
-      out: folder.
-      prediction: folder of `dipn-eval prediction`.
-      grasp: folder of `dipn-eval grasp`.
-      clears: folders of `dipn-eval clear`.
-      sweep: folder of `dipn-eval sweep`.
-      runs: training runs.
+    prediction: pathlib.Path | None = None  # of dipn-eval prediction
+    grasp: pathlib.Path | None = None  # of dipn-eval grasp
+    clears: Sequence[pathlib.Path] = ()  # of dipn-eval clear
+    sweep: pathlib.Path | None = None  # of dipn-eval sweep
+    runs: Sequence[pathlib.Path] = ()  # of dipn-train
+
+
+def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
+    """Write `report.html`, its pictures and `metrics.json` to a folder; returns the metrics of all sources.
 
     Raises:
-      UserError: a folder lacks what its command writes.
+      UserError: there are no sources, or a folder lacks what its command writes.
     """
-    values: dict[str, Any] = {}
-    parts: list[str] = []
-    figures: dict[str, Any] = {}
-    try:
-        if clears:
-            cleared = [comparison.Cleared(folder) for folder in clears]
-            values |= comparison.flat(cleared)
-            part, more = comparison.section(cleared)
-            parts.append(part)
-            figures |= more
-        if sweep:
-            values |= metrics.read(sweep)
-            figures["sweep"] = sweeping.figure(values)
-            parts.append(f"<h2>Push distance</h2>{sweeping.table(values)}{{sweep}}")
-        if prediction:
-            values |= metrics.read(prediction)
-            figures["prediction"] = _prediction_film(_load(prediction / "films.npz"))
-            parts.append(_prediction_section(values))
-        if grasp:
-            values |= metrics.read(grasp)
-            parts.append(_grasp_section(values))
-        if runs:
-            figures["curves"] = _curves(runs)
-            parts.append("<h2>Learning curves</h2>{curves}")
-    except (KeyError, TypeError) as error:
-        raise UserError(f"report: a folder lacks {error}; give the folders that dipn-eval wrote") from None
+    values, parts, figures = _sections(sources)
     if not parts:
         raise UserError("report: nothing to report; give --prediction, --grasp, --clear, --sweep or --runs")
     body = "".join(parts)
@@ -87,6 +59,37 @@ def write(
     files.write_atomically(out / "report.html", page.encode())
     files.write_json(out / "metrics.json", values)
     return values
+
+
+def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, Any]]:
+    """Metrics, the sections as HTML with places for figures, and the figures by name."""
+    values: dict[str, Any] = {}
+    parts: list[str] = []
+    figures: dict[str, Any] = {}
+    try:
+        if sources.clears:
+            cleared = [comparison.Cleared(folder) for folder in sources.clears]
+            values |= comparison.flat(cleared)
+            part, more = comparison.section(cleared)
+            parts.append(part)
+            figures |= more
+        if sources.sweep:
+            values |= metrics.read(sources.sweep)
+            figures["sweep"] = sweeping.figure(values)
+            parts.append(f"<h2>Push distance</h2>{sweeping.table(values)}{{sweep}}")
+        if sources.prediction:
+            values |= metrics.read(sources.prediction)
+            figures["prediction"] = _prediction_film(_load(sources.prediction / "films.npz"))
+            parts.append(_prediction_section(values))
+        if sources.grasp:
+            values |= metrics.read(sources.grasp)
+            parts.append(_grasp_section(values))
+        if sources.runs:
+            figures["curves"] = _curves(sources.runs)
+            parts.append("<h2>Learning curves</h2>{curves}")
+    except (KeyError, TypeError) as error:
+        raise UserError(f"report: a folder lacks {error}; give the folders that dipn-eval wrote") from None
+    return values, parts, figures
 
 
 def _figure(value: float | None) -> str:
@@ -139,7 +142,7 @@ def _prediction_film(films: Any) -> Any:
     return figure
 
 
-def _curves(runs: list[pathlib.Path]) -> Any:
+def _curves(runs: Sequence[pathlib.Path]) -> Any:
     figure, axes = plt.subplots(1, len(runs), figsize=(4 * len(runs), 3), squeeze=False)
     for axis, run in zip(axes[0], runs, strict=True):
         try:

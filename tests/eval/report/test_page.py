@@ -31,8 +31,8 @@ def test_the_report_is_one_file_with_its_pictures(
     (tmp_path / "p").mkdir()
     np.savez_compressed(tmp_path / "p" / "films.npz", **films)  # type: ignore[arg-type]
     metrics.write(tmp_path / "p", values, settings={})
-    options: dict[str, Any] = {"grasp": None, "clears": [cleared[1]], "sweep": None, "runs": list(runs.values())}
-    merged = page.write(tmp_path, prediction=tmp_path / "p", **options)
+    sources = page.Sources(prediction=tmp_path / "p", clears=[cleared[1]], runs=list(runs.values()))
+    merged = page.write(tmp_path, sources)
     written = (tmp_path / "report.html").read_text()
     assert written.count("data:image/png;base64,") == 5
     assert "74.4" in written, "the paper's numbers stand beside"
