@@ -168,7 +168,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     scene, poses, held, good = acting.execute(engine, before.scene, before.poses, pushing, push, grasp)
     then: Look = jax.device_get(look(keys[1], scene, poses, np.ones(count, bool)))
     changed = acting.changed(now, then)
-    success = held.any(1)
+    success = np.asarray(held.any(1))
     effect = np.where(pushing, changed, success)
     reward = np.where(pushing, acting.push_reward(now, then, method=config.method), success.astype(float))
     target = reward
