@@ -181,7 +181,9 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     ):
         if name in PARTS[config.method] and rows.any():
             aim = Grasp(centre, angle, np.zeros(count, np.float32))
-            tried = GraspEpisode(before.scene, before.poses, poses, aim, held, success, np.zeros(count, int))
+            tried = GraspEpisode(
+                before.scene, before.poses, poses, aim, held, np.asarray(success), np.zeros(count, int)
+            )
             taught = windows(structs.take(tried, rows), pixels=WINDOWS[config.preset] + 2 * PHASE)
             state.seen[name].append(taught.replace(target=target.astype(np.float32)[rows]))
     state.did += [("push" if pushing[i] else "grasp", float(reward[i])) for i in np.flatnonzero(good)]

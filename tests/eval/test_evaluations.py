@@ -54,7 +54,7 @@ def test_calibration_error_of_known_scores() -> None:
     for held, error in ((1, 0.05), (0, 0.95)):
         found = success.calibration(np.full(10, 0.95), np.full(10, held))
         assert found["expected_calibration_error"] == pytest.approx(error)
-        assert found["reliability/9/count"] == 10 and found["reliability/9/success"] == success
+        assert found["reliability/9/count"] == 10 and found["reliability/9/success"] == held
 
 
 def _ended(name: str, steps: list[str], removed: int, objects: int) -> instances.Instance:
