@@ -116,7 +116,7 @@ def view_grid(height: int, width: int) -> Float[jax.Array, "{height} {width} 2"]
 
 def sample_nearest(
     image: Shaped[Array, "H W *c"], pixels: Float[Array, "*b 2"], fill: float | int = 0
-) -> Shaped[jax.Array, "*any"]:
+) -> Shaped[jax.Array, "*_"]:
     """`image` at fractional `pixels` (col, row), nearest, `[*b, *c]`; `fill` outside."""
     h, w = image.shape[:2]
     at = jnp.round(pixels).astype(jnp.int32)

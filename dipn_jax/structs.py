@@ -61,12 +61,12 @@ class Fault(enum.IntFlag):
     """What each bit is called in metrics and logs."""
 
     @classmethod
-    def usable(cls, codes: Int[Array, "*any"]) -> Bool[np.ndarray, "*any"]:
+    def usable(cls, codes: Int[Array, "*_"]) -> Bool[np.ndarray, "*_"]:
         """Which of the simulations with these fault codes can be believed."""
         return (np.asarray(codes) & cls.UNUSABLE) == 0
 
     @classmethod
-    def count(cls, codes: Int[Array, "*any"]) -> dict[str, int]:
+    def count(cls, codes: Int[Array, "*_"]) -> dict[str, int]:
         """How many of the fault codes carry each named fault."""
         flat = np.asarray(codes).reshape(-1)
         return {name: int(((flat & bit) != 0).sum()) for bit, name in cls.NAMES.items()}

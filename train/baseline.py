@@ -168,7 +168,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     scene, poses, held, good = acting.execute(engine, before.scene, before.poses, pushing, push, grasp)
     then: Look = jax.device_get(look(keys[1], scene, poses, np.ones(count, bool)))
     changed = acting.changed(now, then)
-    success = held.any(1)
+    success = np.asarray(held.any(1))
     effect = np.where(pushing, changed, success)
     reward = np.where(pushing, acting.push_reward(now, then, method=config.method), success.astype(float))
     target = reward
@@ -186,11 +186,11 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
                 after=poses,
                 grasp=aim,
                 held=held,
-                success=target.astype(np.float32),
+                success=success,
                 fault=np.zeros(count, int),
             )
             taught = windows(structs.take(tried, rows), pixels=WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS)
-            state.seen[name].append(taught)
+            state.seen[name].append(taught.replace(target=target.astype(np.float32)[rows]))
     state.did += [("push" if pushing[i] else "grasp", float(reward[i])) for i in np.flatnonzero(good)]
     state.anew, state.then = state.tables.step(scene, poses, effect, good, engine, scenes), then
 

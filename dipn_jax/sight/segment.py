@@ -21,7 +21,7 @@ _REACH = 4  # pixels over which a fragment goes to a neighbour
 _MOST_REGIONS = 200
 
 
-def segment(height: Real[Array, "*any"], color: Real[Array, "*other"], *, slots: int) -> Int[np.ndarray, "224 224"]:
+def segment(height: Real[Array, "*_"], color: Real[Array, "*_"], *, slots: int) -> Int[np.ndarray, "224 224"]:
     """Instance masks of one image.
 
     Args:

@@ -168,9 +168,9 @@ def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
     held = np.zeros((2, 3), bool)
     target = np.array([1.0, 0.0], np.float32)
     batch = windows(
-        GraspEpisode(first[0], first[1], first[1], aim, held, target, np.zeros(2, int)),
+        GraspEpisode(first[0], first[1], first[1], aim, held, held.any(1), np.zeros(2, int)),
         pixels=WINDOW_PIXELS["compact"] + 2 * SHIFT_PIXELS,
-    )
+    ).replace(target=target)
     batch = structs.take(batch, np.arange(32) % 2)  # each is moved by some pixels of its own
     model = checkpoint.build("vpg", VpgConfig(parts=("grasp",), width=8, coarse=8))
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
