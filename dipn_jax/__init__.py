@@ -69,7 +69,7 @@ _HOME = {name: f"dipn_jax.{module}" for module, names in _MODULES.items() for na
 
 
 def __getattr__(name: str) -> Any:
-    """The public name, imported from its module at its first use."""
+    """Import a public name from its module when it is first used, and return it."""
     if name not in _HOME:
         raise AttributeError(f"module 'dipn_jax' has no attribute {name!r}; it has {', '.join(__all__)}")
     value = getattr(importlib.import_module(_HOME[name]), name)

@@ -1,4 +1,4 @@
-"""Compiled functions over any number of rows, in batches of two fixed sizes."""
+"""Calls of compiled functions with any number of rows, in batches of two fixed sizes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 BATCH = 64
-"""Rows that compiled functions take at a time."""
+"""Rows that a compiled function takes at a time."""
 SMALL_BATCH = 16
-"""Rows taken at a time where a row costs much, or where few are left."""
+"""Rows taken at a time where each row is expensive, or where few are left."""
 
 
 def in_batches(function: Callable[..., Any], *args: Any) -> Any:
@@ -38,7 +38,8 @@ def in_batches(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def in_small_batches(function: Callable[..., Any], *args: Any) -> Any:
-    """Return `function(*args)` as `in_batches` does, SMALL_BATCH rows at a time; for functions that cost much a row.
+    """Return `function(*args)` as `in_batches` does, SMALL_BATCH rows at a time; for functions whose rows are
+    expensive.
 
     `function(*rows, real)` also gets `real [SMALL_BATCH]` bool: which of its rows are rows of `args`. The others only
     fill the batch up.

@@ -1,4 +1,4 @@
-"""What the three commands share with a terminal: progress, help, one-line errors, the compilation cache.
+"""What the three commands need to talk to a terminal: progress, help, one-line errors, the compilation cache.
 
 The only module of the library that prints. Importing it imports no JAX, so that `--help` answers at once.
 """
@@ -48,7 +48,7 @@ def enable_compilation_cache() -> None:
 
 
 class Progress:
-    """A bar on a terminal, a line every few seconds in a log. Use as a context manager."""
+    """A progress bar on a terminal, a line every few seconds in a log. Use it as a context manager."""
 
     def __init__(self, title: str, total: int, *, unit: str, done: int = 0) -> None:
         self.title, self.total, self.unit = title, total, unit
@@ -86,7 +86,7 @@ class Progress:
             self._line()
 
     def advance(self, amount: int, note: str = "") -> None:
-        """`amount` more are done; `note` is shown beside the count. Any thread may call."""
+        """Count `amount` more as done and show `note` beside the count. Any thread may call this."""
         with self._lock:
             self.done += amount
             self.note = note
@@ -112,31 +112,31 @@ class Progress:
 
 
 def say(text: str) -> None:
-    """One line for the user, on standard output."""
+    """Print one line for the user on standard output."""
     print(text, flush=True)
 
 
 def require_positive(**values: float) -> None:
-    """UserError for the first value that is not a finite number above zero."""
+    """Raise a UserError for the first value that is not a finite number above zero."""
     for name, value in values.items():
         if not (math.isfinite(value) and value > 0):
             raise UserError(f"{_option(name)} {value}: want a number above 0")
 
 
 def require_between(low: float, high: float, **values: float) -> None:
-    """UserError for the first value outside [low, high]."""
+    """Raise a UserError for the first value outside [low, high]."""
     for name, value in values.items():
         if not low <= value <= high:
             raise UserError(f"{_option(name)} {value}: want {low} to {high}")
 
 
 def require_seed(seed: int) -> None:
-    """UserError for a seed that is not an unsigned 32-bit number."""
+    """Raise a UserError if `seed` is not an unsigned 32-bit number."""
     require_between(0, 2**32 - 1, seed=seed)
 
 
 def require_out(out: pathlib.Path) -> None:
-    """UserError where a folder `out` cannot be made or written to; makes nothing."""
+    """Raise a UserError if the folder `out` cannot be made or written to; creates nothing."""
     existing = next(p for p in (out, *out.resolve().parents) if p.exists())
     if not existing.is_dir():
         raise UserError(f"--out {out}: {existing} is not a folder; give another")
@@ -149,7 +149,7 @@ def _option(name: str) -> str:
 
 
 class Interruption:
-    """Within it, the first SIGINT or SIGTERM only sets `requested`; a second one acts as usual."""
+    """A context in which the first SIGINT or SIGTERM only sets `requested`; a second one acts as usual."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -171,7 +171,7 @@ class Interruption:
 
 
 def _described(command: Callable[..., Any], *, whole: bool) -> str:
-    """The text of a command's help: the first sentence of its docstring, or everything before `Args:`.
+    """Return the text of a command's help: the first sentence of its docstring, or everything before `Args:`.
 
     Tyro joins a line that begins with a letter to the line before. So every paragraph becomes one line here and is set
     apart by a blank line; indented lines, which are examples to be copied, stay as they are below their paragraph.
@@ -227,12 +227,14 @@ def exit_code(work: Callable[[], int | None]) -> int:
         )
         return 2
     except KeyboardInterrupt:
-        print("interrupted: the same command goes on from here", file=sys.stderr)
+        print("interrupted: run the same command again to continue from here", file=sys.stderr)
         return 130
 
 
 def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> None:
-    """Call the command that `arguments` name; its own help is whole, the list of all gives each a sentence."""
+    """Call the command that `arguments` name. Its own help is complete; the list of all commands gives each one
+    sentence.
+    """
     choices = tuple(
         Annotated[
             Any,

@@ -1,6 +1,6 @@
 """What a physics engine is: its settings, and the one call that simulates a batch of scenes.
 
-The engines themselves are in `dipn_jax.physics`; whoever simulates is handed one of them.
+The engines themselves are in `dipn_jax.physics`; a function that simulates takes one of them as an argument.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
 @dataclasses.dataclass(frozen=True)
 class PhysicsConfig:
-    """Solver settings, by measurement: see `docs` of MuJoCo for each option's meaning."""
+    """Solver settings, chosen by measurement; MuJoCo's documentation explains each option."""
 
     timestep: float = 0.002  # seconds
     iterations: int = 50
@@ -29,7 +29,7 @@ class PhysicsConfig:
     contact_points: tuple[int, int] | None = None  # MJX: contacts kept, likewise (None: all)
 
     def caps(self, slots: int) -> tuple[int, int]:
-        """Pairs and contacts that MJX keeps with `slots` objects; -1: all."""
+        """Return how many geom pairs and contacts MJX keeps with `slots` objects; -1 means all."""
         given = (self.geom_pairs, self.contact_points)
         return tuple(-1 if cap is None else max(cap[0], cap[1] * slots) for cap in given)  # type: ignore[return-value]
 
@@ -43,7 +43,7 @@ class Engine(Protocol):
     name: str
     config: PhysicsConfig
     batch: int
-    """Scenes it is best given at a time: data sets are made in batches of as many."""
+    """Number of scenes that it simulates fastest: data sets are made in batches of that size."""
 
     def simulate(
         self,
@@ -74,9 +74,9 @@ class Engine(Protocol):
         ...
 
     def stop(self) -> None:
-        """From another thread: end `simulate`, now and from now on, as soon as can be."""
+        """End `simulate`, now and in all later calls, as soon as possible; to be called from another thread."""
         ...
 
 
 class Stopped(Exception):
-    """An engine was told to stop."""
+    """Raised by `Engine.simulate` after `Engine.stop` was called."""

@@ -1,10 +1,10 @@
-"""The one exception that a command turns into one line and exit code 2."""
+"""The exception that a command turns into one line and exit code 2."""
 
 from __future__ import annotations
 
 
 class UserError(Exception):
-    """Something that a user gave cannot be used; the text says what was given, what is wanted and what to do.
+    """Something that the user gave cannot be used; the text says what was given, what is wanted and what to do.
 
     try:
         policy = dipn_jax.load_policy("vpg")

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: JSON, checksums, and folders that belong to one configuration."""
+"""Files that are either complete or absent: JSON, checksums, and folders that belong to one configuration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dipn_jax.errors import UserError
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that results depend on."""
+    """Return the versions of the packages that results depend on."""
     return dict(_versions())
 
 
@@ -32,7 +32,7 @@ def _versions() -> dict[str, str]:
 
 
 def code_digest(*folders: pathlib.Path) -> str:
-    """SHA-256 of the packages' versions, the library's sources and those in other `folders`, in hex."""
+    """Return the SHA-256, in hex, of the packages' versions, the library's sources and those in other `folders`."""
     digest = hashlib.sha256(str(package_versions()).encode())
     for folder in (pathlib.Path(__file__).parent, *folders):
         for path in sorted(folder.rglob("*.py")):
@@ -41,7 +41,7 @@ def code_digest(*folders: pathlib.Path) -> str:
 
 
 def file_sha256(path: pathlib.Path) -> str:
-    """SHA-256 of a file's bytes, in hex."""
+    """Return the SHA-256 of a file's bytes, in hex."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(1 << 20):
@@ -50,7 +50,7 @@ def file_sha256(path: pathlib.Path) -> str:
 
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
-    """Write under a temporary name, sync, rename."""
+    """Write a file under a temporary name, sync it, then rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # workers in containers may share process numbers
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
@@ -65,12 +65,12 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:
-    """Write JSON atomically, keys in the given order."""
+    """Write a JSON file atomically, keys in the given order."""
     write_atomically(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
-    """A JSON file.
+    """Return what a JSON file holds.
 
     Raises:
       UserError: it is missing, is not JSON, or is not a `wanted` at its top.

@@ -11,7 +11,7 @@ from dipn_jax.workspace import WORKSPACE
 
 
 def quat_to_matrix(quat: Float[Array, "*b 4"]) -> Float[jax.Array, "*b 3 3"]:
-    """Rotation matrix of a unit quaternion (wxyz)."""
+    """Return the rotation matrix of a unit quaternion (wxyz)."""
     w, x, y, z = jnp.moveaxis(quat, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -22,7 +22,7 @@ def quat_to_matrix(quat: Float[Array, "*b 4"]) -> Float[jax.Array, "*b 3 3"]:
 
 
 def quat_multiply(a: Float[Array, "*#b 4"], b: Float[Array, "*#b 4"]) -> Float[jax.Array, "*b 4"]:
-    """Hamilton product of quaternions (wxyz): rotate by `b`, then by `a`."""
+    """Return the Hamilton product of two quaternions (wxyz): rotate by `b`, then by `a`."""
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
     bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
     return jnp.stack(
@@ -37,51 +37,51 @@ def quat_multiply(a: Float[Array, "*#b 4"], b: Float[Array, "*#b 4"]) -> Float[j
 
 
 def quat_about_z(angle: Float[Array, "*b"] | float) -> Float[jax.Array, "*b 4"]:
-    """Quaternion (wxyz) of a rotation by `angle` radians about z."""
+    """Return the quaternion (wxyz) of a rotation by `angle` radians about z."""
     half = jnp.asarray(angle) / 2
     zero = jnp.zeros_like(half)
     return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], -1)
 
 
 def random_quat(key: Key[Array, ""], *, shape: tuple[int, ...] = ()) -> Float[jax.Array, "*shape 4"]:
-    """Uniformly random rotations (wxyz)."""
+    """Return uniformly random rotations as quaternions (wxyz)."""
     q = jax.random.normal(key, (*shape, 4))
     return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def wrap_angle(angle: Float[Array, "*b"]) -> Float[jax.Array, "*b"]:
-    """The same angle (radians) in [-pi, pi)."""
+    """Return the same angle (radians) in [-pi, pi)."""
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 
 def rotate2d(xy: Num[Array, "*#b 2"], angle: Float[Array, "*#b"] | float) -> Float[jax.Array, "*b 2"]:
-    """Points rotated by `angle` radians about the origin."""
+    """Rotate points by `angle` radians about the origin."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     x, y = xy[..., 0], xy[..., 1]
     return jnp.stack([c * x - s * y, s * x + c * y], -1)
 
 
 def metres_to_pixels(xy: Float[Array, "*b 2"]) -> Float[Array, "*b 2"]:
-    """Workspace metres (x, y) to fractional pixels (col, row); centres are integers."""
+    """Convert workspace metres (x, y) to fractional pixels (col, row); pixel centres are integers."""
     return (xy + WORKSPACE.half) / WORKSPACE.pixel - 0.5
 
 
 def pixels_to_metres(pixels: Num[Array, "*b 2"]) -> Float[jax.Array, "*b 2"]:
-    """Inverse of `metres_to_pixels`."""
+    """Convert fractional pixels (col, row) to workspace metres (x, y)."""
     return (jnp.asarray(pixels, jnp.float32) + 0.5) * WORKSPACE.pixel - WORKSPACE.half
 
 
 def transform_poses(
     poses: Float[Array, "N 7"], angle: Float[Array, ""] | float, shift: Float[Array, " 2"]
 ) -> Float[jax.Array, "N 7"]:
-    """Poses rotated by `angle` radians about the workspace's origin, then shifted by `shift` metres."""
+    """Rotate poses by `angle` radians about the workspace's origin, then shift them by `shift` metres."""
     xy = rotate2d(poses[..., :2], angle) + shift
     quat = quat_multiply(quat_about_z(angle), poses[..., 3:])
     return jnp.concatenate([xy, poses[..., 2:3], quat], -1)
 
 
 def planar_angle(before: Float[Array, "*#b 4"], after: Float[Array, "*#b 4"]) -> Float[jax.Array, "*b"]:
-    """The rotation about z (radians) nearest to the turn between two quaternions (wxyz).
+    """Return the rotation about z (radians) that is nearest to the turn between two quaternions (wxyz).
 
     It maximizes the trace of Rz(angle)^T R, with R the turn as a matrix: exact for a turn about z.
     """
@@ -95,7 +95,7 @@ def planar_angle(before: Float[Array, "*#b 4"], after: Float[Array, "*#b 4"]) ->
 def planar_motion(
     before: Float[Array, "*#b 7"], after: Float[Array, "*#b 7"], center: Float[Array, "*#b 2"]
 ) -> Float[jax.Array, "*b 3"]:
-    """Motion (dx, dy metres, dtheta radians) of a planar body between two poses.
+    """Return the motion (dx, dy metres, dtheta radians) of a planar body between two poses.
 
     Args:
       before: poses before.
@@ -109,7 +109,7 @@ def planar_motion(
 
 
 def view_grid(height: int, width: int) -> Float[jax.Array, "{height} {width} 2"]:
-    """Pixel centres as (col, row)."""
+    """Return the pixel centres of a map as (col, row)."""
     rows, cols = jnp.meshgrid(jnp.arange(height), jnp.arange(width), indexing="ij")
     return jnp.stack([cols, rows], -1).astype(jnp.float32)
 
@@ -117,7 +117,7 @@ def view_grid(height: int, width: int) -> Float[jax.Array, "{height} {width} 2"]
 def sample_nearest(
     image: Shaped[Array, "H W *c"], pixels: Float[Array, "*b 2"], fill: float | int = 0
 ) -> Shaped[jax.Array, "*_"]:
-    """`image` at fractional `pixels` (col, row), nearest, `[*b, *c]`; `fill` outside."""
+    """Return the pixels of `image` that are nearest to fractional `pixels` (col, row), `[*b, *c]`; `fill` outside."""
     h, w = image.shape[:2]
     at = jnp.round(pixels).astype(jnp.int32)
     col, row = at[..., 0], at[..., 1]
@@ -130,7 +130,7 @@ def sample_nearest(
 def rotate_map(
     image: Shaped[Array, "H W *c"], angle: Float[Array, ""] | float, size: int, fill: float | int = 0
 ) -> Shaped[jax.Array, "{size} {size} *c"]:
-    """A map turned about its centre by `-angle`, so that direction `angle` becomes the columns' (+x).
+    """Rotate a map about its centre by `-angle`, so that direction `angle` becomes that of the columns (+x).
 
     Args:
       image: a map, or several in its last axes.
@@ -150,5 +150,5 @@ def rotate_map(
 def unrotate_map(
     image: Shaped[Array, "H W *c"], angle: Float[Array, ""] | float, size: int, fill: float | int = 0
 ) -> Shaped[jax.Array, "{size} {size} *c"]:
-    """Inverse of `rotate_map`."""
+    """Undo `rotate_map`."""
     return rotate_map(image, -angle, size, fill)

@@ -1,4 +1,4 @@
-"""The machine and the sources that results were made with."""
+"""Facts about the machine and the sources that made a result."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 
 
 def processor() -> str:
-    """Name of the processor, as the operating system gives it."""
+    """Return the name of the processor, as the operating system gives it."""
     info = pathlib.Path("/proc/cpuinfo")
     rows = info.read_text().splitlines() if info.exists() else []
     names = (row.partition(":")[2].strip() for row in rows if row.startswith("model name"))
@@ -17,12 +17,14 @@ def processor() -> str:
 
 
 def cores() -> int:
-    """Processor cores that this process may use."""
+    """Return how many processor cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def commit() -> str:
-    """Commit of these sources, with `-dirty` where a Python file differs from it; `unknown` outside of a checkout."""
+    """Return the commit of these sources, with `-dirty` if a Python file differs from it; `unknown` outside a
+    checkout.
+    """
     git = ["git", "-C", str(pathlib.Path(__file__).parent.parent)]
     try:
         head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""Names that are options of the commands: importing this imports no JAX, so that `--help` answers at once."""
+"""Names of engines and methods, options of the commands. Importing this imports no JAX, so `--help` answers at once."""
 
 from __future__ import annotations
 
@@ -7,4 +7,4 @@ from typing import Literal
 EngineName = Literal["auto", "native", "mjx", "warp"]
 """A physics engine; `auto` chooses the faster one here."""
 MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
-"""A method that clears tables: the networks, or the physics engine, that decide between pushing and grasping."""
+"""A method that clears tables, named after the networks (or the physics engine) that it decides with."""

@@ -1,4 +1,4 @@
-"""The types that cross the rooms of the project.
+"""The types that are passed between the packages of the project.
 
 Every field states its shape in its annotation (tests check it, see CONTRIBUTING.md), its unit and frame beside it. `*b`
 stands for any leading batch axes, added by `jax.vmap` or by the caller; they are the same for all fields of one struct.
@@ -29,9 +29,9 @@ ABSENT = -1
 
 
 class Fault(enum.IntFlag):
-    """Bits of a fault code: failure inside a simulation is data, not an exception.
+    """Bits of a fault code: a simulation that goes wrong returns one and raises nothing.
 
-    A member is an `int`; only NumPy takes it for an int64, where it takes a plain 1 for what the array beside it is.
+    A member is an `int`, but NumPy treats it as an int64, while a plain 1 takes the type of the array beside it.
     """
 
     NON_FINITE = 1  # a position or velocity became inf or NaN
@@ -62,31 +62,31 @@ class Fault(enum.IntFlag):
 
     @classmethod
     def usable(cls, codes: Int[Array, "*_"]) -> Bool[np.ndarray, "*_"]:
-        """Which of the simulations with these fault codes can be believed."""
+        """Return which of the simulations with these fault codes can be used."""
         return (np.asarray(codes) & cls.UNUSABLE) == 0
 
     @classmethod
     def count(cls, codes: Int[Array, "*_"]) -> dict[str, int]:
-        """How many of the fault codes carry each named fault."""
+        """Return how many of the fault codes have each named fault."""
         flat = np.asarray(codes).reshape(-1)
         return {name: int(((flat & bit) != 0).sum()) for bit, name in cls.NAMES.items()}
 
 
 class Pytree:
-    """What every struct can do: `replace` (added by `flax.struct.dataclass`), and indexing along the leading axis."""
+    """Base of every struct: `replace` (added by `flax.struct.dataclass`), and indexing along the leading axis."""
 
     def replace(self, **changes: Any) -> Any:
-        """A copy with some fields replaced."""
+        """Return a copy with some fields replaced."""
         raise NotImplementedError
 
     def __getitem__(self, index: Any) -> Any:
-        """Row `index` of a batched struct, or the rows of a slice or an index array."""
+        """Return row `index` of a batched struct, or the rows of a slice or an index array."""
         return jax.tree.map(lambda leaf: leaf[index], self)
 
 
 @flax.struct.dataclass
 class Scene(Pytree):
-    """What lies on the table, apart from where it lies.
+    """The objects on the table, without their poses.
 
     names, scenes, poses = dipn_jax.load_cases()    # a dipn_jax.Scene with a leading axis
     scenes[0].replace(friction=np.full(6, 0.2))
@@ -101,7 +101,7 @@ class Scene(Pytree):
 
 @flax.struct.dataclass
 class Observation(Pytree):
-    """What the camera sees, orthographic, straight down.
+    """What the camera sees from straight above, orthographic.
 
     observation = dipn_jax.Observation(height, color, label, slots=10)
     """
@@ -138,7 +138,7 @@ class Grasp(Pytree):
 
 @flax.struct.dataclass
 class Trajectory(Pytree):
-    """Gripper set points, linear between `K` key frames."""
+    """Set points of the gripper, linear between `K` key frames."""
 
     time: Float[Array, "*b K"]  # seconds, increasing
     target: Float[Array, "*b K 5"]  # x, y, tip height (metres), yaw of the closing axis (radians), inner gap (metres)
@@ -155,7 +155,7 @@ class Rollout(Pytree):
 
 @flax.struct.dataclass
 class Outcome(Pytree):
-    """Result of a grasp."""
+    """The result of a grasp."""
 
     held: Bool[Array, "*b N"]  # objects in the hand after the lift
     success: Bool[Array, "*b"]  # at least one
@@ -163,7 +163,7 @@ class Outcome(Pytree):
 
 @flax.struct.dataclass
 class PushEpisode(Pytree):
-    """One push: everything needed to render it, before, during and after."""
+    """One push, with everything needed to render it before, during and after."""
 
     scene: Scene
     poses: Float[Array, "*b 11 N 7"]  # at 0, 1, ..., 10 cm of travel; past `push.distance`, as often (every 0.1 s)
@@ -187,7 +187,7 @@ class GraspEpisode(Pytree):
 
 @flax.struct.dataclass
 class SettledScene(Pytree):
-    """A scene at rest; the data set of images is made of these."""
+    """A scene at rest; the data set of images consists of these."""
 
     scene: Scene
     poses: Float[Array, "*b N 7"]  # position (metres) and quaternion wxyz, workspace
@@ -196,7 +196,7 @@ class SettledScene(Pytree):
 
 @flax.struct.dataclass
 class Candidates(Pytree):
-    """What there is to choose from on one table: the best grasp, and pushes."""
+    """The actions to choose from on one table: the best grasp, and pushes."""
 
     pushes: Push  # [P]
     feasible: Bool[Array, "*b P"]
@@ -208,7 +208,7 @@ class Candidates(Pytree):
 
 @flax.struct.dataclass
 class Decision(Pytree):
-    """What was chosen on one table, and what it was compared with.
+    """The action chosen on one table, and what it was compared with.
 
     decision = policy(key, observation)             # a dipn_jax.Decision
     action = decision.push if decision.is_push else decision.grasp
@@ -228,28 +228,28 @@ class Decision(Pytree):
     predicted: Float[Array, "*b H W 4"] | None = None  # predicted RGB and height after the best push
 
     def brief(self) -> Decision:
-        """Return the decision without candidates and images: what is kept of many tables."""
+        """Return the decision without its candidates and images, to be kept for many tables."""
         brief: Decision = self.replace(best=None, values=None, candidates=None, predicted=None)
         return brief
 
 
 def concatenate(batches: list[Any]) -> Any:
-    """Structs with a leading axis, joined along it, as numpy."""
+    """Join structs along their leading axis, as NumPy arrays."""
     return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *batches)
 
 
 def take(episodes: Any, index: np.ndarray | slice | int) -> Any:
-    """Episodes `index` of a batched struct, as numpy."""
+    """Return the episodes `index` of a batched struct, as NumPy arrays."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[index], episodes)
 
 
 def stack(items: list[Any]) -> Any:
-    """Structs of one kind, stacked along a new leading axis, as numpy."""
+    """Stack structs of one kind along a new leading axis, as NumPy arrays."""
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *items)
 
 
 def cast(items: Any) -> Any:
-    """The same with every floating-point leaf as float32, as numpy."""
+    """Return a copy as NumPy arrays, with every floating-point leaf as float32."""
 
     def one(leaf: Any) -> np.ndarray:
         array = np.asarray(leaf)

@@ -16,12 +16,12 @@ class Workspace:
 
     @property
     def half(self) -> float:
-        """Half the side, metres."""
+        """Half the side, in metres."""
         return self.side / 2
 
     @property
     def pixel(self) -> float:
-        """Metres a pixel."""
+        """The side of a pixel, in metres."""
         return self.side / self.pixels
 
 
@@ -48,25 +48,27 @@ class Gripper:
 
     @property
     def lag(self) -> float:
-        """Seconds by which the position loop trails a ramp: velocity gain over position gain."""
+        """Seconds by which the position loop follows a ramp late: velocity gain over position gain."""
         return 2.0 / self.bandwidth
 
     @property
     def push_width(self) -> float:
-        """Width of the closed gripper across its travel, metres."""
+        """The width of the closed gripper across its travel, in metres."""
         return self.push_gap + 2 * self.thickness
 
 
 WORKSPACE = Workspace()
+"""The workspace that the whole project uses."""
 GRIPPER = Gripper()
+"""The gripper that the whole project uses."""
 TURNED_PIXELS = 320
-"""Pixels a side of a map into which the workspace fits at any angle (source: the paper's GN input)."""
+"""Side in pixels of a map that holds the workspace at any angle (source: the paper's GN input)."""
 ROTATIONS = 16
-"""Grasp and push directions, evenly in [0, 2 pi)."""
+"""Number of directions of grasps and pushes, evenly in [0, 2 pi)."""
 PUSH_STEPS = 10
-"""Centimetres of a recorded push."""
+"""Length of a recorded push in centimetres."""
 
 
 def grasp_angles() -> np.ndarray:
-    """The closing-axis angles `[16]` in radians."""
+    """Return the 16 angles of the closing axis `[16]` in radians."""
     return (np.arange(ROTATIONS) * (2 * np.pi / ROTATIONS)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Which actions to consider: pushes from the contours of object bundles, grasps at pixels.
+"""The actions to consider: pushes from the contours of object bundles, grasps at pixels.
 
 Everything runs on the device on a padded number of candidates; nothing is traced out point by point.
 """
@@ -17,21 +17,21 @@ from dipn_jax.structs import ABSENT, Array, Grasp, Observation, Push
 from dipn_jax.workspace import ROTATIONS, WORKSPACE
 
 STANDOFF = 15
-"""Pixels from the contact back to a push's start. Source: DIPN's released code."""
+"""Distance in pixels from the contact back to a push's start. Source: DIPN's released code."""
 CENTER_RANGE = (25, 199)
-"""Pixels: a centre predicted outside drops the push. Source: DIPN's released code."""
+"""Pixels between which a predicted centre must stay, or the push is dropped. Source: DIPN's released code."""
 
 TIP_CLEARANCE = 0.001
 """Metres between a fingertip and what it would otherwise press on."""
 MIN_GRIP_DEPTH = 0.015
-"""Metres of an object that are between the fingers at least, even where a finger then presses on something."""
+"""Smallest depth of an object between the fingers in metres, even where a finger then presses on something."""
 LOW_OBJECT_RAISE = 0.004
 """Metres by which fingertips may stop short over an object that is too low for MIN_GRIP_DEPTH."""
 
 SAME_GRASP_PIXELS = 10.0
-"""Pixels by which the centres of two grasps differ at most to count as the same grasp."""
+"""Largest distance in pixels between the centres of two grasps that count as the same grasp."""
 SAME_GRASP_ROTATIONS = 1
-"""Rotations (of 16) by which two grasps differ at most to count as the same grasp."""
+"""Largest difference in rotations (of 16) between two grasps that count as the same grasp."""
 
 _OVERSAMPLE = 4
 
@@ -44,7 +44,7 @@ def sample_pushes(
     count: int,
     distance: Float[Array, ""] | Float[Array, " {count}"] | float,
 ) -> tuple[Push, Bool[jax.Array, " {count}"]]:
-    """Candidate pushes of one observation.
+    """Sample the candidate pushes of one observation.
 
     Args:
       key: random key.
@@ -78,14 +78,14 @@ def sample_pushes(
 
 
 def push_at(index: Int[Array, " 3"], distance: Float[Array, ""] | float) -> Push:
-    """The push that starts at `index [3]` (rotation, row, col) and goes `distance []` metres."""
+    """Return the push that starts at `index [3]` (rotation, row, col) and goes `distance []` metres."""
     index = jnp.asarray(index)
     start = geometry.pixels_to_metres(jnp.stack([index[2], index[1]], -1))
     return Push(start, index[0] * jnp.float32(2 * jnp.pi / ROTATIONS), jnp.float32(distance))
 
 
 def push_index(push: Push) -> Int[jax.Array, " 3"]:
-    """The pixel and direction nearest to a push: `[3]` int32 (rotation, row, col)."""
+    """Return the pixel and direction nearest to a push: `[3]` int32 (rotation, row, col)."""
     pixel = jnp.round(geometry.metres_to_pixels(push.start))
     rotation = jnp.round(push.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
     return jnp.stack([rotation, pixel[1], pixel[0]]).astype(jnp.int32)
@@ -94,7 +94,7 @@ def push_index(push: Push) -> Int[jax.Array, " 3"]:
 def stays_inside(
     centers: Float[Array, "N 2"], area: Float[Array, " N"], motion: Float[Array, "N 3"]
 ) -> Bool[jax.Array, ""]:
-    """Whether no visible centre `[N, 2]` (metres) leaves CENTER_RANGE by `motion [N, 3]`."""
+    """Return whether every visible centre `[N, 2]` (metres) stays in CENTER_RANGE after `motion [N, 3]`."""
     pixel = geometry.metres_to_pixels(centers + motion[:, :2])
     before = geometry.metres_to_pixels(centers)
     low, high = CENTER_RANGE
@@ -103,7 +103,7 @@ def stays_inside(
 
 
 def grasp_at(index: Int[Array, "*b 3"], height: Float[Array, "H W"]) -> Grasp:
-    """The grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres).
+    """Return the grasp `[...]` of `index [..., 3]` (rotation, row, col) on a height map `[H, W]` (metres).
 
     The tips go to `fingers.grasp_height`. Where a finger would press on something on its way there they stop above it,
     but leave MIN_GRIP_DEPTH of the object between them at least, or rise LOW_OBJECT_RAISE over a low object.
@@ -119,7 +119,7 @@ def grasp_at(index: Int[Array, "*b 3"], height: Float[Array, "H W"]) -> Grasp:
 
 
 def grasp_index(grasp: Grasp) -> Int[jax.Array, "*b 3"]:
-    """Inverse of `grasp_at`: `[..., 3]` int32 (rotation, row, col)."""
+    """Return the index `[..., 3]` int32 (rotation, row, col) of a grasp: the inverse of `grasp_at`."""
     pixel = jnp.round(geometry.metres_to_pixels(grasp.center))
     rotation = jnp.round(grasp.angle * (ROTATIONS / (2 * jnp.pi))) % ROTATIONS
     return jnp.stack([rotation, pixel[..., 1], pixel[..., 0]], -1).astype(jnp.int32)
@@ -127,7 +127,7 @@ def grasp_index(grasp: Grasp) -> Int[jax.Array, "*b 3"]:
 
 @functools.partial(jax.jit, static_argnames="count")
 def random_grasps(key: Key[Array, ""], observation: Observation, *, count: int) -> Grasp:
-    """`count` grasps at uniformly random foreground pixels, each at one of the 16 angles."""
+    """Draw `count` grasps at uniformly random foreground pixels, each at one of the 16 angles."""
     pixel_key, angle_key = jax.random.split(key)
     noise = jax.random.uniform(pixel_key, (observation.label.size,))
     _, pixel = jax.lax.top_k(jnp.where(observation.label.reshape(-1) != ABSENT, noise, -1.0), count)
@@ -145,7 +145,7 @@ def sample_grasps(
     guided: Float[Array, ""] | float,
     hard: Float[Array, ""] | float,
 ) -> Grasp:
-    """Draw `count` grasps: some that a scorer believes in, some that it is unsure of, the others at random.
+    """Draw `count` grasps: some with the highest scores, some with uncertain ones, the others at random.
 
     Args:
       key: random key.
@@ -175,7 +175,7 @@ def sample_grasps(
 
 
 def best_grasp(scores: Float[Array, "R H W"]) -> tuple[Int[jax.Array, " 3"], Float[jax.Array, ""]]:
-    """The best of scores `[16, H, W]`: index `[3]` (rotation, row, col) and its score."""
+    """Return the index `[3]` (rotation, row, col) of the best of scores `[16, H, W]`, and its score."""
     flat = jnp.argmax(scores)
     index = jnp.stack(jnp.unravel_index(flat, scores.shape)).astype(jnp.int32)
     return index, scores.reshape(-1)[flat]
@@ -199,7 +199,9 @@ def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) ->
 
 
 def best_grasps(scores: Float[Array, "R H W"], *, count: int, apart: float = 8.0) -> Int[jax.Array, "{count} 3"]:
-    """The `count` best of scores `[16, H, W]` that are at least `apart` pixels from one another: `[count, 3]`."""
+    """Return the `count` best of scores `[16, H, W]` that are at least `apart` pixels from one another: `[count,
+    3]`.
+    """
     grid = geometry.view_grid(*scores.shape[1:])
 
     def next_best(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:

@@ -1,4 +1,4 @@
-"""The methods that clear tables: one registry of what each needs and how it is built. `load_policy` builds one.
+"""The methods that clear tables: a registry of what each needs and how it is built. `load_policy` builds one.
 
 A new method is one entry of `METHODS`.
 """
@@ -29,9 +29,9 @@ ROLES: dict[NetworkRole, tuple[str, str]] = {
     "grasp": ("grasp", "grasp"),
     "value": ("vpg", "baseline"),
 }
-"""What a network does in a method -> its name in checkpoints, and the dipn-train command that makes it."""
+"""What a network does in a method -> its name in checkpoints, and the dipn-train command that trains it."""
 LONGEST_PUSH = 0.12
-"""Metres."""
+"""Longest push in metres."""
 
 Act = Callable[[jax.Array, Observation, Array, Rule, Array], Decision]
 """(key, observation, grasps that missed [M, 3], rule, distances of the candidates [P] metres) -> decision."""
@@ -39,7 +39,7 @@ Act = Callable[[jax.Array, Observation, Array, Rule, Array], Decision]
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A method that is ready to decide: observation in, decision out.
+    """A method with its networks, ready to decide: observation in, decision out.
 
     `act` is compiled once; policies that differ in rule or distances only share it (`with_config`).
     """
@@ -61,7 +61,7 @@ class Policy:
         return self.act(key, observation, missed, self.rule, self.distances)
 
     def with_config(self, config: PolicyConfig) -> Policy:
-        """The same networks with another rule and other distances; as many candidates as before."""
+        """Return a policy of the same networks with another rule and other distances; as many candidates as before."""
         return dataclasses.replace(self, rule=config.rule(), distances=config.spread())
 
 
@@ -77,7 +77,7 @@ class PolicyConfig:
     cautious: bool = True  # GN's scores are the least of four answers; False: GN as published
 
     def rule(self) -> Rule:
-        """What the planner compares by."""
+        """Return the rule that the planner compares by."""
         rule = planner.RELEASED if self.released else Rule()
         result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above)
         return result
@@ -93,7 +93,7 @@ Runs = dict[str, pathlib.Path]
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """What a method is."""
+    """What a method is: the networks it needs and how its policy is built."""
 
     networks: tuple[NetworkRole, ...]  # that it decides with
     build: Callable[[Runs, PolicyConfig], Policy] | None  # None: it decides on the simulator's state, not on images
@@ -103,14 +103,14 @@ class Method:
 
 @dataclasses.dataclass(frozen=True)
 class Networks:
-    """Runs that a method decides with, by role."""
+    """The runs that a method takes its networks from, by role."""
 
     push: pathlib.Path | None = None  # dipn-train push
     grasp: pathlib.Path | None = None  # dipn-train grasp
     value: pathlib.Path | None = None  # dipn-train baseline
 
     def runs(self, method: str) -> Runs:
-        """The runs that `method` needs.
+        """Return the runs that `method` needs.
 
         Raises:
           UserError: no such method, or one of its networks was not given.
@@ -123,7 +123,7 @@ class Networks:
 
 
 def find(name: str) -> Method:
-    """The method called `name`.
+    """Return the method called `name`.
 
     Raises:
       UserError: there is none.
@@ -165,13 +165,13 @@ def load_policy(
 
 
 def grasping_policy(scorer: Scorer) -> Policy:
-    """The policy that grasps where `scorer` scores highest, and never pushes."""
+    """Return the policy that grasps where `scorer` is highest, and never pushes."""
     act = imagining(predictors.static_predictor, scorer, None)
     return Policy(act, Rule(grasp_above=-1.0), np.array([0.1], np.float32))
 
 
 def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSummary | None) -> Act:
-    """Alg. 2: imagine the image after every candidate push."""
+    """Build the policy of Alg. 2: imagine the image after every candidate push."""
 
     def act(key: jax.Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
         count = len(distances)
@@ -183,7 +183,7 @@ def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSumm
 
 
 def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Act:
-    """The better of the best push and the best grasp by their values; all pushes go the first distance.
+    """Build the policy that compares the best push and the best grasp by value; all pushes go the first distance.
 
     Args:
       push_scorer: values of pushes.
@@ -201,7 +201,7 @@ def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Ac
 
 
 def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSummary]:
-    """The scorer that GN's grasps are chosen by, and the summary that images are compared by.
+    """Return the scorer that GN's grasps are chosen by, and the summary that images are compared by.
 
     The clauses of the released code look at the highest score on every image, which only whole images tell.
     """
@@ -235,7 +235,7 @@ def _gn(runs: Runs, config: PolicyConfig) -> Policy:
 
 
 def _chances(run: pathlib.Path) -> Scorer:
-    """The scorer of the grasps of REA.
+    """Return the scorer of the grasps of REA.
 
     Raises:
       UserError: the run answers with values, of which neither a mean nor the threshold 0.7 has a meaning.
@@ -249,7 +249,7 @@ def _chances(run: pathlib.Path) -> Scorer:
 
 
 def _part(run: pathlib.Path, name: str) -> Scorer:
-    """The scorer of pushes or of grasps of a baseline.
+    """Return the scorer of pushes or of grasps of a baseline.
 
     Raises:
       UserError: it was trained without.
@@ -270,3 +270,4 @@ METHODS: dict[str, Method] = {
     "gn": Method(("grasp",), _gn, "GN's best grasp, never a push", pushes=False),
     "physics+gn": Method(("grasp",), None, "imagine every push with the engine itself: a privileged ceiling"),
 }
+"""All methods by name."""

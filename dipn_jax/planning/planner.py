@@ -1,4 +1,4 @@
-"""Push or grasp? Alg. 2 of the paper, and the rule of two score maps. Predictor and scorer arrive as functions.
+"""Push or grasp? Alg. 2 of the paper, and the rule of two score maps. Predictor and scorer are arguments.
 
 `decide` is one jitted call: candidates, predicted images and the scores of every grasp on each of them never leave the
 device. Its two halves are `find_candidates` and `decide_among`; they serve predictors that are no function of an image.
@@ -29,11 +29,11 @@ ScoreSummary = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.
 Index 0 is the image now. Images that are not wanted may get any finite numbers."""
 
 NONE_MISSED = np.full((1, 3), -1, np.int32)
-"""No grasp has missed."""
+"""The value of `missed` when no grasp has missed."""
 UNDRAWN_SHIFT = 0.001
-"""Metres: a predicted motion that is smaller, and turns by less than UNDRAWN_TURN, is not drawn (half a pixel)."""
+"""Metres: a predicted motion smaller than this, with a turn below UNDRAWN_TURN, is not drawn (half a pixel)."""
 UNDRAWN_TURN = np.deg2rad(1.0)
-"""Radians; see UNDRAWN_SHIFT. At the end of an object that is half a pixel, too."""
+"""Radians; see UNDRAWN_SHIFT. At the end of an object this is half a pixel, too."""
 
 
 @flax.struct.dataclass
@@ -63,7 +63,7 @@ RELEASED = Rule(edge_factor=2.0, grasp_lone=True, push_must_raise_best=True, dis
 
 
 def summarize_whole(scorer: Scorer) -> ScoreSummary:
-    """The summary that scores every wanted image whole."""
+    """Return the summary that scores every wanted image whole."""
 
     def summarize(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(args: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -197,7 +197,7 @@ def decide_by_value(
     grasp_above: Float[Array, ""] | float = jnp.inf,
     missed: Int[Array, "M 3"] = NONE_MISSED,
 ) -> Decision:
-    """Choose the best of all grasps or the best of all pushes by their values, imagining nothing, as VPG does.
+    """Choose the best of all grasps and pushes by their values, without imagining images, as VPG does.
 
     Args:
       observation: what the camera sees now.

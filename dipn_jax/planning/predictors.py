@@ -1,4 +1,4 @@
-"""Where every object goes when it is pushed, as functions that the planner calls: the two baselines, and DIPN."""
+"""Predictors, functions that say where every object goes when one is pushed: two baselines, and DIPN."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from dipn_jax.structs import ABSENT, Array, Observation, Push
 
 
 def static_predictor(observation: Observation, pushes: Push) -> Float[jax.Array, "P N 3"]:
-    """Baseline: nothing moves; a Predictor."""
+    """Predict that nothing moves: a baseline, a Predictor."""
     return jnp.zeros((pushes.angle.shape[0], observation.slots, 3))
 
 
 def trans_predictor(observation: Observation, pushes: Push) -> Float[jax.Array, "P N 3"]:
-    """Baseline: only the pushed object moves, by the push length along the push; a Predictor."""
+    """Predict that only the pushed object moves, by the push length along the push: a baseline, a Predictor."""
 
     def one(label: jax.Array, push: Push) -> jax.Array:
         hit = imagine.move_toward(label, push.start, push.angle)
@@ -58,7 +58,7 @@ def dipn_motions(
 
 
 def dipn_predictor(model: dipn.DIPN) -> Predictor:
-    """DIPN as a predictor of each push's own distance."""
+    """Return DIPN as a predictor of each push's own distance."""
     graph, state = nnx.split(model)
 
     def predict(observation: Observation, pushes: Push) -> jax.Array:
@@ -69,7 +69,7 @@ def dipn_predictor(model: dipn.DIPN) -> Predictor:
 
 
 def load_predictor(run: pathlib.Path | str) -> Predictor:
-    """The predictor of a `dipn-train push` run, or `builtin`.
+    """Load the predictor of a `dipn-train push` run, or `builtin`.
 
     Raises:
       UserError: as `checkpoint.load_network`.

@@ -1,4 +1,4 @@
-"""What grasps, pushes and whole images are worth to a network, as functions that the planner calls."""
+"""Scorers, functions that say what a network thinks of grasps, pushes and whole images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _frozen(model: nnx.Module) -> Callable[[], nnx.Module]:
 
 
 def _scorer(model: nnx.Module, score: Callable[[Any, jax.Array], jax.Array]) -> Scorer:
-    """`score` of one image after another."""
+    """Return a scorer that applies `score` to one image after another."""
     thaw = _frozen(model)
 
     def scores(images: jax.Array) -> jax.Array:
@@ -33,17 +33,20 @@ def _scorer(model: nnx.Module, score: Callable[[Any, jax.Array], jax.Array]) -> 
 
 
 def cautious_scorer(model: grasp.GraspNet) -> Scorer:
-    """GN as a scorer to act on: `grasp.cautious_scores` of a `compact` network, plain scores of the published one."""
+    """Return GN as a scorer to choose by: `grasp.cautious_scores` of `compact`, plain scores of the published
+    network.
+    """
     return _scorer(model, grasp.cautious_scores if model.config.preset == "compact" else grasp.score_image)
 
 
 def plain_scorer(model: grasp.GraspNet) -> Scorer:
-    """GN as a scorer, its scores as they are."""
+    """Return GN as a scorer with its scores as they are."""
     return _scorer(model, grasp.score_image)
 
 
 def grasp_summary(model: grasp.GraspNet) -> ScoreSummary:
-    """Mean and highest score of all grasps on imagined images, the fast way where there is one.
+    """Return the function that summarizes scores of imagined images by mean and highest, the fast way where there is
+    one.
 
     `compact` networks on a CPU score only what moved; elsewhere images are scored whole. The highest score of the fast
     way is not that of the image.
@@ -59,7 +62,7 @@ def grasp_summary(model: grasp.GraspNet) -> ScoreSummary:
 
 
 def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
-    """Scorers of pushes and of grasps of a baseline's network; None where it has no such part."""
+    """Return the scorers of pushes and of grasps of a baseline's network; None where it has no such part."""
     squash = nnx.sigmoid if model.config.answers == "chance" else (lambda x: x)
 
     def scorer(name: Literal["push", "grasp"]) -> Scorer | None:
@@ -71,7 +74,7 @@ def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
 
 
 def load_scorer(run: pathlib.Path | str, *, cautious: bool = True) -> Scorer:
-    """The scorer of a `dipn-train grasp` run, or `builtin`, to act on.
+    """Load the scorer of a `dipn-train grasp` run, or `builtin`, to choose grasps by.
 
     Raises:
       UserError: as `checkpoint.load_network`.
@@ -81,7 +84,7 @@ def load_scorer(run: pathlib.Path | str, *, cautious: bool = True) -> Scorer:
 
 
 def load_values(run: pathlib.Path | str) -> tuple[Scorer | None, Scorer | None]:
-    """The scorers of pushes and of grasps of a `dipn-train baseline` run; None of a part that it was trained without.
+    """Load the scorers of pushes and grasps of a `dipn-train baseline` run; None for a part that was not trained.
 
     Raises:
       UserError: as `checkpoint.load_network`.
@@ -92,7 +95,7 @@ def load_values(run: pathlib.Path | str) -> tuple[Scorer | None, Scorer | None]:
 def load_summary(
     run: pathlib.Path | str, *, network: Literal["grasp", "vpg"] = "grasp", whole: bool = False
 ) -> ScoreSummary:
-    """Mean and highest score of all grasps on imagined images, as the network of a run scores them.
+    """Load the function that summarizes a network's scores of imagined images by mean and highest.
 
     Args:
       run: of `dipn-train grasp` (or `builtin`), or of `dipn-train baseline`.

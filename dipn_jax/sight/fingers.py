@@ -1,4 +1,4 @@
-"""What a height map alone says of grasps and pushes: what the fingers would come down on."""
+"""What a height map alone tells about grasps and pushes: where the fingers would come down."""
 
 from __future__ import annotations
 
@@ -14,36 +14,38 @@ from dipn_jax.structs import Array
 from dipn_jax.workspace import GRIPPER, ROTATIONS, TURNED_PIXELS, WORKSPACE, grasp_angles
 
 EMPTY_HEIGHT = 0.005
-"""Metres above the table up to which a pixel shows none of an object: no grasp is centred there, and none is learnt."""
+"""Height in metres up to which a pixel counts as empty table: no grasp is centred there, and none is learnt."""
 FREE_HEIGHT = 0.01
-"""Metres: what is lower counts as free where a push starts. Source: DIPN's released code."""
+"""Height in metres below which a pixel counts as free where a push starts. Source: DIPN's released code."""
 START_RANGE = (10, 214)
-"""Pixels, first and last row and column where a push may start. Source: DIPN's released code."""
+"""First and last row and column, in pixels, where a push may start. Source: DIPN's released code."""
 _MARGIN = 0.004  # metres around the closed gripper's footprint
 
 MIN_DEPTH = 0.002
-"""Metres of object that must be between the fingers; objects 25 mm high lie 5 mm over the lowest fingertip."""
+"""Metres of object that must be between the fingers; objects 25 mm high reach 5 mm above the lowest fingertip."""
 FINGER_COLUMNS = tuple(
     round(off / WORKSPACE.pixel) for off in (GRIPPER.stroke / 2, GRIPPER.stroke / 2 + GRIPPER.thickness)
 )
-"""Pixels from the middle of a grasp to where a finger begins and ends."""
+"""Distances in pixels from the middle of a grasp to where a finger begins and ends."""
 BLOCKED_HEIGHT = 0.02
-"""Metres by which something under a finger stands over where its tip is to go: it can rarely push that aside."""
+"""Metres above a fingertip's goal from which something under it blocks the grasp: it can rarely be pushed aside."""
 HIDDEN_WIDTH = 12
-"""Pixels by which an object that reaches the border may extend beyond it, out of sight: half a large one."""
+"""Pixels by which an object that reaches the border may extend beyond it, out of sight: half a large object."""
 HIDDEN_HEIGHT = 1.0
-"""Metres: how high such an object is taken to be out of sight."""
+"""Assumed height in metres of the hidden part of such an object."""
 
 
 def grasp_height(local_height: Float[Array, "*b"] | float) -> Float[jax.Array, "*b"]:
-    """Tip height for a surface `local_height` metres above the table. Source: DIPN's released code."""
+    """Return the height of the fingertips for a surface `local_height` metres above the table. Source: DIPN's
+    released code.
+    """
     return jnp.maximum(jnp.asarray(local_height) - 0.04, 0.02)
 
 
 def under_fingers(
     height: Float[Array, "H W"], center: Float[Array, "*b 2"], angle: Float[Array, "*b"]
 ) -> Float[jax.Array, "*b"]:
-    """The highest point, metres, that the open fingers of grasps come down on.
+    """Return the highest point, in metres, that the open fingers of each grasp come down on.
 
     What reaches the border of the map is taken to go on beyond it.
 
@@ -64,7 +66,7 @@ def under_fingers(
 def footprint_free(
     height: Float[Array, "H W"], start: Float[Array, " 2"], angle: Float[Array, ""] | float
 ) -> Bool[jax.Array, ""]:
-    """Whether the closed gripper can come down at `start` (metres), broad side toward `angle` (radians)."""
+    """Return whether the closed gripper can come down at `start` (metres), broad side toward `angle` (radians)."""
     along = jnp.linspace(-0.5, 0.5, 7) * (GRIPPER.pad_width + _MARGIN)
     across = jnp.linspace(-0.5, 0.5, 13) * (GRIPPER.push_width + _MARGIN)
     local = jnp.stack(jnp.meshgrid(along, across, indexing="ij"), -1).reshape(-1, 2)
@@ -73,7 +75,7 @@ def footprint_free(
 
 
 def pushable(height: Float[Array, "H W"]) -> Bool[jax.Array, "16 H W"]:
-    """Where on a height map the closed gripper can come down, in each direction."""
+    """Return where on a height map the closed gripper can come down, in each direction."""
     size = height.shape[0]
     rows, cols = (2 * math.ceil(side / 2 / WORKSPACE.pixel) + 1 for side in (GRIPPER.push_width, GRIPPER.pad_width))
     pixel = jnp.arange(size)
@@ -90,7 +92,7 @@ def pushable(height: Float[Array, "H W"]) -> Bool[jax.Array, "16 H W"]:
 
 
 def geometric_labels(height: Float[jax.Array, "H W"]) -> Float[jax.Array, "H W"]:
-    """Which grasps are free of physics' objections, from the height map of a turned view alone.
+    """Return which grasps look possible, judged from the height map of a turned view alone.
 
     A grasp centred on a pixel and closing along its row is positive when there is object between the
     fingers at the depth they would reach, and none where they come down: a pad's width of rows, and
@@ -107,7 +109,7 @@ def geometric_labels(height: Float[jax.Array, "H W"]) -> Float[jax.Array, "H W"]
 
 
 def _under_fingers(height: Float[Array, "H W"]) -> Float[jax.Array, "H W"]:
-    """The highest point, metres, that the fingers of a grasp centred on each pixel come down on."""
+    """Return the highest point, in metres, that the fingers of a grasp centred on each pixel come down on."""
 
     def highest(low: int, high: int, half_rows: int) -> jax.Array:
         rows, cols = 2 * half_rows + 1, high - low + 1
@@ -124,12 +126,12 @@ def _under_fingers(height: Float[Array, "H W"]) -> Float[jax.Array, "H W"]:
 
 
 def label_image(height: Float[Array, "224 224"]) -> Float[jax.Array, "16 224 224"]:
-    """`geometric_labels` of every grasp on a height map, as `score_image`."""
+    """Return `geometric_labels` of every grasp on a height map, in the layout of `score_image`."""
     return _of_every_grasp(height, geometric_labels)
 
 
 def blocked_image(height: Float[Array, "224 224"]) -> Float[jax.Array, "16 224 224"]:
-    """Which grasps on a height map a finger stops short of: 1 where so, else 0.
+    """Return 1 for each grasp on a height map whose finger would land on something, else 0.
 
     It would come down on something that stands BLOCKED_HEIGHT over where its tip is to go, or out of sight near
     something that reaches the border.
@@ -147,7 +149,7 @@ def blocked_image(height: Float[Array, "224 224"]) -> Float[jax.Array, "16 224 2
 def _of_every_grasp(
     height: Float[Array, "H W"], judge: Callable[[jax.Array], jax.Array]
 ) -> Float[jax.Array, "16 224 224"]:
-    """`judge` of turned views, turned back; a grasp turned by half a turn is the same grasp."""
+    """Apply `judge` to turned views and turn the results back; a grasp turned by half a turn is the same grasp."""
 
     def one(angle: jax.Array) -> jax.Array:
         return geometry.unrotate_map(judge(geometry.rotate_map(height, angle, TURNED_PIXELS)), angle, WORKSPACE.pixels)

@@ -1,4 +1,4 @@
-"""Predicted motions -> predicted image: each object's pixels moved and painted into the emptied scene."""
+"""The image predicted from motions: each object's pixels are moved and painted into the emptied scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dipn_jax.structs import ABSENT, Array, Observation
 from dipn_jax.workspace import WORKSPACE
 
 WINDOW = 80
-"""Pixels around a moved mask's centroid; wider than the renderer's, since a half-hidden mask is off centre."""
+"""Pixels around a moved mask's centroid; wider than the renderer's window, since a half-hidden mask is off centre."""
 
 
 @jax.jit
@@ -55,7 +55,9 @@ def imagine(observation: Observation, centers: Float[Array, "N 2"], motion: Floa
 def move_toward(
     label: Int[Array, "H W"], start: Float[Array, " 2"], angle: Float[Array, ""] | float
 ) -> Int[jax.Array, ""]:
-    """The object that the middle of a push from `start` (metres) along `angle` (radians) meets first, or ABSENT."""
+    """Return the object that the middle of a push from `start` (metres) along `angle` (radians) meets first, or
+    ABSENT.
+    """
     steps = jnp.arange(0.0, 0.2, WORKSPACE.pixel / 2)
     path = start + steps[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     met = geometry.sample_nearest(label, geometry.metres_to_pixels(path), ABSENT)

@@ -1,4 +1,4 @@
-"""Masks of label maps: where they are, and their contours."""
+"""Masks of a label map: their centroids and sizes, and their contours."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dipn_jax.structs import Array
 from dipn_jax.workspace import WORKSPACE
 
 _COLUMN_BITS = 20
-"""Low bits of a packed sum that hold the sum of columns; the number of pixels is above them."""
+"""Low bits of a packed sum that hold the sum of columns; the number of pixels is in the bits above."""
 
 
 def mask_centers(

@@ -1,4 +1,4 @@
-"""Scene and poses -> what an orthographic camera straight above sees. Pure, batched, without OpenGL.
+"""The renderer: what an orthographic camera straight above sees of a scene. Pure, batched, without OpenGL.
 
 A vertical ray meets a convex part between its highest lower plane and its lowest upper plane, so a height
 map is a minimum and a maximum of affine functions of the pixel, taken in a window around each object.
@@ -19,8 +19,11 @@ from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
 WINDOW = 64
-"""Pixels: at 2 mm a pixel it holds any object of diagonal `shapes.MAX_DIAGONAL`."""
+"""Side in pixels of the window that an object is drawn in: at 2 mm a pixel it holds a diagonal of
+`shapes.MAX_DIAGONAL`.
+"""
 TABLE_COLOR = (0.2, 0.2, 0.2)
+"""RGB of the table."""
 _STEEP = 1e-6  # |n_z| below which a face is taken as vertical
 _FAR = 1e3
 
@@ -28,7 +31,7 @@ _FAR = 1e3
 def _bounds(
     scene: Scene, poses: Float[Array, "N 7"]
 ) -> tuple[Float[jax.Array, "N P F 3"], Bool[jax.Array, "N P F"], Bool[Array, "N P"]]:
-    """Affine bounds on z (constant, x, y), which of them are from above, and which parts there are."""
+    """Return affine bounds on z (constant, x, y), which of them are from above, and which parts exist."""
     hulls = jax.vmap(shapes.hull)(scene.shape, scene.size)
     rotation = geometry.quat_to_matrix(poses[:, 3:])
     with jax.default_matmul_precision("highest"):  # tenths of millimetres, which accelerators else round away
@@ -42,7 +45,7 @@ def _bounds(
 def _top(
     plane: Float[Array, "F 3"], above: Bool[Array, " F"], x: Float[Array, " W"], y: Float[Array, " H"]
 ) -> Float[jax.Array, "H W"]:
-    """Top of a part over pixels at `x` and `y` (metres); `-_FAR` beside it."""
+    """Return the top of a part over pixels at `x` and `y` (metres); `-_FAR` beside the part."""
     top, bottom = jnp.float32(_FAR), jnp.float32(-_FAR)
     for face in range(plane.shape[0]):
         height = plane[face, 0] + plane[face, 1] * x[None, :] + plane[face, 2] * y[:, None]
@@ -58,7 +61,7 @@ def _tops(
     x: Float[Array, " W"],
     y: Float[Array, " H"],
 ) -> Float[jax.Array, "H W"]:
-    """Top of an object, as `_top`. A missing part costs nothing where scenes are not vmapped."""
+    """Return the top of an object, as `_top`. A missing part costs nothing where scenes are not vmapped."""
     nothing = jnp.full((y.shape[0], x.shape[0]), -_FAR)
     best = nothing
     for part in range(plane.shape[0]):
@@ -71,7 +74,7 @@ def _tops(
 def render_depth(
     scene: Scene, poses: Float[Array, "N 7"], *, pixels: int = WORKSPACE.pixels
 ) -> tuple[Float[jax.Array, "{pixels} {pixels}"], Int[jax.Array, "{pixels} {pixels}"]]:
-    """Height map and labels of one scene.
+    """Render the height map and the labels of one scene.
 
     Args:
       scene: one scene (no batch axis).
@@ -120,18 +123,18 @@ def render(scene: Scene, poses: Float[Array, "N 7"], *, pixels: int = WORKSPACE.
 
 
 def paint_labels(label: Int[Array, "H W"], color: Float[Array, "N 3"]) -> Float[jax.Array, "H W 3"]:
-    """Colours of a label map with object colours (RGB in [0, 1]); the table elsewhere."""
+    """Paint a label map with object colours (RGB in [0, 1]) and the colour of the table."""
     palette = jnp.concatenate([color, jnp.array([TABLE_COLOR])])
     return palette[jnp.where(label == ABSENT, color.shape[0], label)]
 
 
 def rgbd(observation: Observation) -> Float[jax.Array, "*b H W 4"]:
-    """The image that networks see: RGB in [0, 1] and height in metres."""
+    """Return the image that networks see: RGB in [0, 1] and height in metres."""
     return jnp.concatenate([observation.color, observation.height[..., None]], -1)
 
 
 def observe(scene: Scene, poses: Float[Array, "B N 7"]) -> Observation:
-    """Observations `[B]` of scenes `[B, N]` and poses `[B, N, 7]`, in memory on the device."""
+    """Render observations `[B]` of scenes `[B, N]` at poses `[B, N, 7]`, in memory on the device."""
     return batching.in_batches(_observe, scene, poses)
 
 

@@ -1,4 +1,4 @@
-"""Masks from an RGB-D image alone: what stands out of the table, cut where its colour changes. OpenCV, on the host."""
+"""Masks found in an RGB-D image alone: what stands on the table, cut where its colour changes. OpenCV, on the host."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from dipn_jax.structs import ABSENT, Array
 from dipn_jax.workspace import WORKSPACE
 
 TABLE_HEIGHT = 0.006
-"""Metres: what is lower and coloured like the table is table; a quarter of the lowest object."""
+"""Height in metres below which what is coloured like the table is table; a quarter of the lowest object."""
 SAME_COLOR = 22
-"""Levels of 255 by which each channel of one object may differ from its middle; palettes differ by more."""
+"""Levels of 255 by which each channel of one object may differ from its median; palettes differ by more."""
 SMALLEST = 30
-"""Pixels (120 mm^2): smaller regions are fragments of their neighbours."""
+"""Size in pixels (120 mm^2) below which a region is a fragment of its neighbour."""
 _GAP = 40  # pixels over which a hidden part is bridged: the widest object above
 _REACH = 4  # pixels over which a fragment goes to a neighbour
 _MOST_REGIONS = 200
 
 
 def segment(height: Real[Array, "*_"], color: Real[Array, "*_"], *, slots: int) -> Int[np.ndarray, "224 224"]:
-    """Instance masks of one image.
+    """Find the instance masks of one image.
 
     Args:
       height: `[224, 224]` metres above the table.
@@ -54,7 +54,7 @@ def segment(height: Real[Array, "*_"], color: Real[Array, "*_"], *, slots: int) 
 
 
 def _off_table(image: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Low pixels that have not the table's colour: the foot of a slope."""
+    """Return the low pixels that do not have the table's colour: the foot of a slope."""
     low = height <= TABLE_HEIGHT
     if not low.any():
         return low
@@ -64,7 +64,9 @@ def _off_table(image: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 
 def _regions(image: np.ndarray, foreground: np.ndarray) -> np.ndarray:
-    """Connected areas of one colour `[H, W]`: 1, 2, ...; 0 elsewhere. Each grows from the middle of what is left."""
+    """Label connected areas of one colour `[H, W]` with 1, 2, ...; 0 elsewhere. Each grows from the middle of what
+    is left.
+    """
     regions = np.zeros(foreground.shape, np.int32)
     left = foreground.astype(np.uint8)
     for number in range(1, _MOST_REGIONS):
@@ -84,7 +86,7 @@ def _regions(image: np.ndarray, foreground: np.ndarray) -> np.ndarray:
 
 
 def _join(regions: np.ndarray, image: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Regions of one colour are one object where only something higher lies between them."""
+    """Merge regions of one colour where only something higher lies between them: they are one object."""
     numbers = [n for n in np.unique(regions) if n]
     mean = {n: np.median(image[regions == n], 0) for n in numbers}
     for i, a in enumerate(numbers):
@@ -95,7 +97,9 @@ def _join(regions: np.ndarray, image: np.ndarray, height: np.ndarray) -> np.ndar
 
 
 def _bridged(first: np.ndarray, second: np.ndarray, height: np.ndarray) -> bool:
-    """Whether the shortest line between two masks is short and passes under something higher than both of them."""
+    """Return whether the shortest line between two masks is short and passes under something higher than both of
+    them.
+    """
     if not first.any() or not second.any():
         return False
     far, nearest = cv2.distanceTransformWithLabels(
@@ -112,7 +116,7 @@ def _bridged(first: np.ndarray, second: np.ndarray, height: np.ndarray) -> bool:
 
 
 def _fill(regions: np.ndarray, foreground: np.ndarray, slots: int) -> np.ndarray:
-    """Labels by size; what is left of the foreground goes to the region beside it."""
+    """Number the labels by size and give the rest of the foreground to the neighbouring regions."""
     far, nearest = cv2.distanceTransformWithLabels(
         (regions == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -127,7 +131,7 @@ def _fill(regions: np.ndarray, foreground: np.ndarray, slots: int) -> np.ndarray
 
 
 def match(found: Int[Array, "H W"], true: Int[Array, "H W"], *, slots: int) -> Int[np.ndarray, " {slots}"]:
-    """Which found mask is which true one: the pair of the greatest IoU first, each mask once.
+    """Assign found masks to true ones: the pair with the greatest IoU first, each mask once.
 
     Args:
       found: labels.
@@ -155,9 +159,9 @@ def match(found: Int[Array, "H W"], true: Int[Array, "H W"], *, slots: int) -> I
 def find(
     height: Real[Array, "224 224"], color: Real[Array, "224 224 3"], true: Int[Array, "224 224"], *, slots: int
 ) -> tuple[Int[np.ndarray, "224 224"], Bool[np.ndarray, " {slots}"]]:
-    """Masks found in one image, numbered as the objects that they overlap most; the rest take the numbers left over.
+    """Find masks in one image, numbered as the objects that they overlap most; the rest take the numbers left over.
 
-    For training and measuring: what a network is shown is what the segmenter saw, and it is known of what.
+    For training and measuring: a network is shown what the segmenter found, and it is known which object that is.
 
     Args:
       height: metres above the table.

@@ -1,4 +1,4 @@
-"""Hand-placed scenes from a case file, the format of `hard_cases.json`."""
+"""Hand-placed scenes read from a case file in the format of `hard_cases.json`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dipn_jax.world import scenes, shapes
 
 
 def hard_cases_path() -> pathlib.Path:
-    """The ten hard instances that come with the package."""
+    """Return the path of the ten hard cases that come with the package."""
     return pathlib.Path(__file__).parents[1] / "data" / "hard_cases.json"
 
 

@@ -1,4 +1,4 @@
-"""key -> scenes at rest, and what the camera sees of many scenes. Data generation and evaluation both begin here."""
+"""Random scenes at rest, from a key, for data generation and evaluation; and how objects are removed by a grasp."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from dipn_jax.structs import Array, Fault, Grasp, Scene, SettledScene
 from dipn_jax.world import primitives, scenes
 
 MAX_DROPS = 128
-"""Drops in a row without a usable scene before giving up."""
+"""Drops in a row without a usable scene after which `settled_scenes` gives up."""
 
 
 def settled(
     key: Key[Array, ""], engine: Engine, config: scenes.SceneConfig, count: int
 ) -> tuple[SettledScene, dict[str, int]]:
-    """Drop `count` random scenes and keep those that came to rest inside the workspace without a fault.
+    """Drop `count` random scenes and return those that came to rest inside the workspace without a fault.
 
     Args:
       key: random key.
@@ -69,7 +69,7 @@ def settled_scenes(key: Key[Array, ""], engine: Engine, config: scenes.SceneConf
 def grasp_away(
     engine: Engine, scene: Scene, poses: Float[Array, "B N 7"], grasps: Grasp
 ) -> tuple[Scene, Float[np.ndarray, "B N 7"], Bool[np.ndarray, "B N"], Int[np.ndarray, " B"]]:
-    """Execute one grasp a scene, take away what is held, let the rest come to rest.
+    """Execute one grasp per scene, remove what is held, and let the rest come to rest.
 
     Args:
       engine: physics.

@@ -1,7 +1,7 @@
-"""Scene -> MJCF: the one description of the world that every engine reads.
+"""The MJCF model of a scene: the one description of the world that every engine reads.
 
-The number of slots fixes the layout (bodies, joints, geoms), so models of different scenes with as many
-slots can run in one batch. `generic=True` gives every part the same placeholder mesh: the engine that
+The number of slots fixes the layout (bodies, joints, geoms), so models of different scenes with the same
+number of slots can run in one batch. `generic=True` gives every part the same placeholder mesh: the engine that
 traces geometry (MJX) replaces its vertices, and compiles once for all scenes.
 """
 
@@ -16,11 +16,13 @@ from dipn_jax.workspace import GRIPPER, Gripper
 from dipn_jax.world import shapes
 
 MARK = "dipn_jax"
-"""Name of a custom number in our MJCF, by which the patches of MJX know our models (`physics.patches`)."""
+"""Name of a custom number in our MJCF that marks a model as ours (`physics.patches` looks for it)."""
 GRIPPER_DOF = 6
-"""x, y, z, yaw, left finger, right finger; then 7 numbers of qpos (6 of qvel) an object."""
+"""Degrees of freedom of the gripper: x, y, z, yaw, left finger, right finger. Each object follows with 7 qpos, 6
+qvel.
+"""
 OBJECT_FRICTION_RATIO = 0.5 / 0.35
-"""Object-object over object-table friction. Source: DIPN's released code."""
+"""Friction between objects over that between object and table. Source: DIPN's released code."""
 
 
 def _gripper(gripper: Gripper) -> str:
@@ -69,7 +71,7 @@ def _text(values: np.ndarray) -> str:
 
 
 def _object(scene: Scene, slot: int, generic: bool, inertia: np.ndarray) -> tuple[str, str]:
-    """Body and mesh assets of one slot; empty slots and missing parts keep the layout with geoms that touch nothing."""
+    """Return the body and the mesh assets of one slot; empty slots and missing parts get geoms that touch nothing."""
     shape, size = int(scene.shape[slot]), np.asarray(scene.size[slot], float)
     present = shape >= 0
     name = shapes.CLASSES[max(shape, 0)]
@@ -93,14 +95,15 @@ def _object(scene: Scene, slot: int, generic: bool, inertia: np.ndarray) -> tupl
 
 
 def inertias(scene: Scene) -> Float[np.ndarray, "*b N 3"]:
-    """Diagonal inertia (kg m^2); that of a harmless ball for empty slots."""
+    """Return the diagonal inertia (kg m^2) of every slot; that of a harmless ball for empty slots."""
     spread = shapes.UNIT_VARIANCE[np.maximum(scene.shape, 0)] * np.asarray(scene.size, float) ** 2
     inertia = np.asarray(scene.mass, float)[:, None] * (spread.sum(-1, keepdims=True) - spread)
     return np.where((np.asarray(scene.shape) >= 0)[:, None], inertia, 1e-4)
 
 
 def _fillers(scene: Scene) -> str:
-    """Meshes that no geom uses: with them the bounding volumes of all meshes have as many nodes in every scene.
+    """Return meshes that no geom uses, so that the bounding volumes of all meshes have the same number of nodes in
+    every scene.
 
     f triangles have 2 f - 1 nodes: a prism of n sides, with f = 4 n - 4, and a double pyramid, with f = 2 n.
     """
@@ -115,7 +118,7 @@ def _fillers(scene: Scene) -> str:
 
 
 def _double_pyramid(name: str, sides: int) -> str:
-    """A mesh of given faces: without any, MuJoCo would look for a hull."""
+    """Return a mesh with explicit faces: without them MuJoCo would compute a convex hull."""
     angle, at = 2 * np.pi * np.arange(sides) / sides, np.arange(sides)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], -1)
     corners = np.round(0.05 * np.concatenate([ring, [[0, 0, 1], [0, 0, -1]]]), 5)  # short to write
@@ -138,14 +141,14 @@ def mjcf(
     generic: bool = False,
     alike: bool = False,
 ) -> str:
-    """The world as an MJCF document.
+    """Return the world as an MJCF document.
 
     Args:
       scene: one scene (no batch axis), numpy arrays; empty slots are kept as bodies that touch nothing.
       config: solver settings.
       gripper: dimensions and gains.
       generic: placeholder geometry in every part (see the module's docstring).
-      alike: add meshes that nothing uses, so that models of any scenes with as many slots share one memory layout.
+      alike: add meshes that nothing uses, so that models of all scenes with the same number of slots are laid out alike.
 
     Returns:
       XML text. qpos is `[x, y, z, yaw, left, right, (position, quaternion) of every slot]`.

@@ -1,4 +1,4 @@
-"""Settle, push, grasp: each is a gripper trajectory and a way to read the result.
+"""The three primitives, settle, push and grasp: each is a gripper trajectory and a way to read the result.
 
 A primitive knows no engine; an engine knows no primitive. All functions broadcast over leading axes.
 """
@@ -33,7 +33,7 @@ HELD_RISE = 0.5  # of the lift: an object that rose by more is held
 
 
 def _frames(times: Sequence[Float[Array, "*b"] | float], targets: list[Float[jax.Array, "*b 5"]]) -> Trajectory:
-    """Key frames from durations (seconds, first 0) and targets."""
+    """Return key frames from durations (seconds, first 0) and targets."""
     target = jnp.stack(targets, -2)
     lasting = [jnp.broadcast_to(jnp.asarray(t, jnp.float32), target.shape[:-2]) for t in times]
     return Trajectory(jnp.cumsum(jnp.stack(lasting, -1), -1), target)
@@ -49,13 +49,13 @@ def _pose(
 
 
 def parked_trajectory(batch: int, duration: float) -> Trajectory:
-    """The gripper stays above everything, out of the way, for `duration` seconds."""
+    """Keep the gripper above everything, out of the way, for `duration` seconds."""
     still = _pose(jnp.zeros((batch, 2)), jnp.float32(2.0), jnp.float32(0.0), GRIPPER.push_gap)
     return _frames([0.0, duration], [still, still])
 
 
 def push_trajectory(push: Push) -> Trajectory:
-    """Down beside the object with the broad side forward, straight on at PUSH_SPEED, up again."""
+    """Go down beside the object with the broad side forward, move straight on at PUSH_SPEED, go up again."""
     yaw = push.angle + np.pi / 2
     direction = jnp.stack([jnp.cos(push.angle), jnp.sin(push.angle)], -1)
     end = push.start + push.distance[..., None] * direction
@@ -68,14 +68,16 @@ def push_trajectory(push: Push) -> Trajectory:
 
 
 def push_samples(*, longest: float = PUSH_STEPS * 0.01) -> Float[np.ndarray, " 12"]:
-    """Seconds: at each centimetre of travel to 10, and at rest after `longest` metres."""
+    """Return the sampled times in seconds: at each centimetre of travel up to 10, and at rest after `longest`
+    metres.
+    """
     begin = DESCEND_TIME + 0.1
     travel = begin + np.arange(PUSH_STEPS + 1) * 0.01 / PUSH_SPEED
     return np.append(travel, begin + longest / PUSH_SPEED + 0.1 + DESCEND_TIME + REST_TIME)
 
 
 def grasp_trajectory(grasp: Grasp) -> Trajectory:
-    """Down with open fingers, close, lift."""
+    """Go down with open fingers, close them, lift."""
     g = GRIPPER
     high = _pose(grasp.center, jnp.maximum(grasp.height + 0.1, 0.2), grasp.angle, g.stroke)
     low_open = _pose(grasp.center, grasp.height, grasp.angle, g.stroke)
@@ -86,7 +88,7 @@ def grasp_trajectory(grasp: Grasp) -> Trajectory:
 
 
 def grasp_samples() -> Float[np.ndarray, " 2"]:
-    """Seconds: at the start, and at the end of the lift. Multiples of the control period."""
+    """Return the sampled times in seconds, at the start and at the end of the lift; multiples of the control period."""
     end = REACH_TIME + 0.05 + GRIPPER.stroke / 2 / CLOSE_SPEED + HOLD_TIME + LIFT_TIME + REST_TIME
     return np.array([0.0, np.ceil(end * 100) / 100])
 
@@ -94,7 +96,7 @@ def grasp_samples() -> Float[np.ndarray, " 2"]:
 def settle(
     engine: Engine, scenes: Scene, poses: Float[Array, "B N 7"], *, duration: float = SETTLE_TIME, fence: float = 0.0
 ) -> Rollout:
-    """Let the scenes come to rest; one sample, at the end. `fence`: see `Engine.simulate`."""
+    """Let the scenes come to rest; one sample, at the end. For `fence` see `Engine.simulate`."""
     batch = len(np.asarray(scenes.shape))
     still, end = parked_trajectory(batch, duration), np.array([duration])
     return engine.simulate(scenes, poses, still, end, settle=True, fence=fence)
@@ -108,26 +110,26 @@ def push(
     *,
     longest: float = PUSH_STEPS * 0.01,
 ) -> Rollout:
-    """Execute one push of at most `longest` metres a scene; 12 samples: at each centimetre, and at rest."""
+    """Execute one push of at most `longest` metres per scene; 12 samples: at each centimetre, and at rest."""
     rollout = engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(longest=longest), settle=True)
     over = tipped(rollout.poses[..., 0, :, 3:], rollout.poses[..., -1, :, 3:]) & (scenes.shape >= 0)
     return rollout.replace(fault=rollout.fault | jnp.where(over.any(-1), Fault.TIPPED, 0))
 
 
 def tipped(before: Float[Array, "*b 4"], after: Float[Array, "*b 4"]) -> Bool[jax.Array, "*b"]:
-    """Which objects with quaternions (wxyz) have another side up, by over 45 degrees."""
+    """Return which objects with quaternions (wxyz) have been tipped by over 45 degrees."""
     up = [geometry.quat_to_matrix(jnp.asarray(quat))[..., 2, :] for quat in (before, after)]
     return (up[0] * up[1]).sum(-1) < np.cos(TIPPED)
 
 
 def grasp(engine: Engine, scenes: Scene, poses: Float[Array, "B N 7"], grasps: Grasp) -> tuple[Rollout, Outcome]:
-    """Execute one grasp a scene; two samples: before, and after the lift."""
+    """Execute one grasp per scene; two samples: before, and after the lift."""
     rollout = engine.simulate(scenes, poses, grasp_trajectory(grasps), grasp_samples())
     return rollout, grasp_outcome(scenes, rollout)
 
 
 def grasp_outcome(scenes: Scene, rollout: Rollout) -> Outcome:
-    """Which objects rose with the hand between the first and the last sample."""
+    """Find which objects rose with the hand between the first and the last sample."""
     rise = rollout.poses[..., -1, :, 2] - rollout.poses[..., 0, :, 2]
     held = (scenes.shape >= 0) & (rise > HELD_RISE * GRIPPER.lift)
     return Outcome(held, held.any(-1))  # type: ignore[arg-type]  # an np.bool where there is no batch axis

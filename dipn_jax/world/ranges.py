@@ -1,4 +1,4 @@
-"""The ranges that random objects are drawn from: options of the commands, so importing this imports no JAX."""
+"""The ranges that random objects are drawn from, options of the commands. Importing this imports no JAX."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from typing import TypeAlias
 from dipn_jax.errors import UserError
 
 Range: TypeAlias = tuple[float, float]
+"""Smallest and largest value."""
 BOUNDS = {"scale": (0.5, 1.2), "density": (10.0, 25_000.0), "friction": (0.01, 5.0)}
-"""Least and most of each range: cork to platinum; what the renderer's window and the fingers' height allow."""
+"""Smallest and largest value allowed in each range: cork to platinum; what the renderer's window and the fingers'
+height allow.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Ranges:
-    """What random objects are drawn from, all uniformly."""
+    """The ranges that random objects are drawn from uniformly."""
 
     items: tuple[str, ...] = ()
     """Names from the catalogue (`shapes.CATALOGUE`); none given: all of them."""
@@ -42,6 +45,7 @@ class Ranges:
 
 
 DEFAULT_RANGES = Ranges()
+"""The ranges used unless told otherwise."""
 
 
 def _require_in_catalogue(items: tuple[str, ...]) -> None:

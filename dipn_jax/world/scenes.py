@@ -18,19 +18,23 @@ from dipn_jax.world import packing, shapes
 from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
 PAPER_COUNTS = (0.02, 0.05, 0.2, 0.35, 0.3, 0.05, 0.03)
-"""P(1..7 objects) of the push data. Source: DIPN's released code."""
+"""Probabilities of 1 to 7 objects in the push data. Source: DIPN's released code."""
 
 
 MIN_SIDE = 0.025
-"""Metres: no side is thinner. The fingertips stop 20 mm above the table, and 2.5 mm of pad cannot hold a box."""
+"""Shortest side of an object in metres. The fingertips stop 20 mm above the table, and 2.5 mm of pad cannot hold a
+box.
+"""
 
-NOMINAL_DENSITY, NOMINAL_FRICTION = 500.0, 0.35
-"""kg/m^3, and between object and table: of what is not known."""
+NOMINAL_DENSITY = 500.0
+"""Density in kg/m^3 where it is not known."""
+NOMINAL_FRICTION = 0.35
+"""Friction between object and table where it is not known."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
-    """What random scenes are made of.
+    """How random scenes are drawn.
 
     config = dipn_jax.SceneConfig(slots=10, counts=(0.1,) * 10)   # 1 to 10 objects, all as likely
     """
@@ -47,24 +51,24 @@ class SceneConfig:
             )
         if min(self.counts) < 0 or sum(self.counts) <= 0:
             raise UserError(f"scene config: counts {self.counts} are not probabilities; want non-negative, sum > 0")
-        if self.ranges.packed and len(self.counts) > packing.MOST:
+        if self.ranges.packed and len(self.counts) > packing.MAX_OBJECTS:
             raise UserError(
-                f"--packed with up to {len(self.counts)} objects: no more than {packing.MOST} stand in rows; "
+                f"--packed with up to {len(self.counts)} objects: no more than {packing.MAX_OBJECTS} stand in rows; "
                 "give fewer objects, or --packed 0"
             )
 
 
 PAPER = SceneConfig()
-"""Of the push data, as published."""
+"""The scenes of the push data, as published."""
 
 
 def fixed_count(count: int, **changes: Any) -> SceneConfig:
-    """A config with exactly `count` objects."""
+    """Return a config with exactly `count` objects."""
     return SceneConfig(slots=count, counts=(0.0,) * (count - 1) + (1.0,), **changes)
 
 
 def parse_objects(text: str, *, ranges: Ranges = DEFAULT_RANGES) -> SceneConfig:
-    """A config from a user's word: `10`, `1:7` (uniform) or `paper` (PAPER_COUNTS).
+    """Return the config for a number of objects given as text: `10`, `1:7` (uniform) or `paper` (PAPER_COUNTS).
 
     More than ten objects are dropped over a wider square, so that their tower is not too high to fall from.
 
@@ -86,7 +90,7 @@ def parse_objects(text: str, *, ranges: Ranges = DEFAULT_RANGES) -> SceneConfig:
 
 @functools.partial(jax.jit, static_argnames="config")
 def random_scene(key: Key[Array, ""], *, config: SceneConfig) -> tuple[Scene, Float[jax.Array, "{config.slots} 7"]]:
-    """Random objects in mid-air, none touching another; or packed (`Ranges.packed`).
+    """Draw random objects in mid-air, none touching another; or packed (`Ranges.packed`).
 
     Args:
       key: random key.
@@ -128,7 +132,7 @@ def random_scene(key: Key[Array, ""], *, config: SceneConfig) -> tuple[Scene, Fl
 
 
 def _allowed(size: Float[Array, "N 3"]) -> Float[jax.Array, "N 3"]:
-    """Sizes with no side under MIN_SIDE and the longest cut where the diagonal is over MAX_DIAGONAL."""
+    """Return sizes with no side under MIN_SIDE and the longest side cut where the diagonal is over MAX_DIAGONAL."""
     size = jnp.maximum(size, MIN_SIDE)
     longest = jnp.arange(3) == size.argmax(-1, keepdims=True)
     others = jnp.where(longest, 0.0, size**2).sum(-1, keepdims=True)
@@ -139,7 +143,7 @@ def _allowed(size: Float[Array, "N 3"]) -> Float[jax.Array, "N 3"]:
 def _stack_heights(
     xy: Float[Array, "N 2"], radius: Float[Array, " N"], present: Bool[Array, " N"]
 ) -> Float[jax.Array, " N"]:
-    """Lowest heights at which spheres of `radius` over `xy` do not overlap, placed in order."""
+    """Return the lowest heights at which spheres of `radius` over `xy` do not overlap, placed in order."""
 
     def place(heights: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
         gap = (xy - xy[i]) ** 2
@@ -153,7 +157,7 @@ def _stack_heights(
 
 
 def parked(n: int) -> Float[jax.Array, "{n} 7"]:
-    """Poses of empty slots: far outside the workspace, apart from one another."""
+    """Return the poses of empty slots: far outside the workspace, apart from one another."""
     x = 5.0 + 0.5 * jnp.arange(n, dtype=jnp.float32)
     zero, one = jnp.zeros(n), jnp.ones(n)
     return jnp.stack([x, zero + 5.0, zero + 1.0, one, zero, zero, zero], -1)
@@ -162,13 +166,13 @@ def parked(n: int) -> Float[jax.Array, "{n} 7"]:
 def remove(
     scene: Scene, poses: Float[Array, "*b N 7"], gone: Bool[Array, "*b N"]
 ) -> tuple[Scene, Float[jax.Array, "*b N 7"]]:
-    """Scenes and poses without the objects `gone`, which are parked."""
+    """Return scenes and poses without the objects `gone`, which are parked."""
     shape = jnp.where(gone, ABSENT, scene.shape)
     return scene.replace(shape=shape), jnp.where(gone[..., None], parked(gone.shape[-1]), poses)
 
 
 def nominal(scene: Scene) -> Scene:
-    """Scenes as one who sees only shapes would guess them: density 500 kg/m^3, friction 0.35."""
+    """Return scenes with guessed physics, as if only shapes were known: density 500 kg/m^3, friction 0.35."""
     shape = np.asarray(scene.shape)
     mass = np.where(shape >= 0, NOMINAL_DENSITY * shapes.volume(shape, np.asarray(scene.size)), 0.1)
     friction = np.full(shape.shape, NOMINAL_FRICTION, np.float32)

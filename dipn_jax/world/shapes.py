@@ -1,4 +1,4 @@
-"""The catalogue: every object as one or more convex prisms.
+"""The catalogue of objects, each made of one or more convex prisms.
 
 A class is defined once, in a unit cube, as up to `PARTS` convex polygons extruded along one axis; an
 object is its class stretched to its bounding box. An object's frame is at its centre of mass, along the
@@ -23,8 +23,11 @@ from jaxtyping import Bool, Float, Int
 from dipn_jax.structs import Array, Pytree
 
 CLASSES = ("cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave")
+"""Classes of shapes; `Scene.shape` is an index into them."""
 CORNERS = 12
+"""Largest number of corners of a part's cross-section."""
 PARTS = 3
+"""Largest number of convex parts of an object."""
 
 Polygon = list[tuple[float, float]]
 
@@ -35,13 +38,15 @@ def _arc(start: float, stop: float, count: int) -> np.ndarray:
 
 
 def _half_disc() -> Polygon:
-    """Flat face down, bounding box [-1/2, 1/2]^2, as (x, z) turned to (z, x) for an extrusion along y."""
+    """Return a half disc with its flat face down, bounding box [-1/2, 1/2]^2, in (z, x) for an extrusion along y."""
     xz = _arc(0, 180, CORNERS - 1) * np.array([1.0, 2.0]) - np.array([0.0, 0.5])
     return [(z, x) for x, z in xz[::-1]]  # mirrored by the swap, hence reversed: counter-clockwise again
 
 
 def _notched() -> list[Polygon]:
-    """The arch in (z, x): a 26 mm half-round notch in a 100 x 50 mm face, as a trapezoid of equal area and depth."""
+    """Return the arch in (z, x): a 26 mm half-round notch in a 100 x 50 mm face, as a trapezoid of equal area and
+    depth.
+    """
     rim, floor, depth = 0.26, 0.148, 0.02  # of 100 mm, of 100 mm, and x = -1 mm of 50 mm
     left = [(-0.5, -0.5), (-floor, -0.5), (-floor, -depth), (-rim, 0.5), (-0.5, 0.5)]
     right = [(-u, v) for u, v in reversed(left)]
@@ -63,7 +68,7 @@ _SECTIONS: dict[str, tuple[int, list[Polygon]]] = {
 
 
 def _rings() -> tuple[np.ndarray, np.ndarray]:
-    """Unit vertices [C, P, 2K, 3] and the number of distinct corners [C, P] (0: no such part)."""
+    """Return the unit vertices [C, P, 2K, 3] and the number of distinct corners [C, P] (0: no such part)."""
     vertices = np.zeros((len(CLASSES), PARTS, 2 * CORNERS, 3))
     used = np.zeros((len(CLASSES), PARTS), np.int32)
     for c, name in enumerate(CLASSES):
@@ -78,7 +83,7 @@ def _rings() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _moments() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Volume [C], centre of mass [C, 3] and variance about it [C, 3] of the unit shapes."""
+    """Return volume [C], centre of mass [C, 3] and variance about it [C, 3] of the unit shapes."""
     volume = np.zeros(len(CLASSES))
     mean = np.zeros((len(CLASSES), 3))
     variance = np.zeros((len(CLASSES), 3))
@@ -104,19 +109,20 @@ UNIT_VOLUME, UNIT_CENTER_OF_MASS, UNIT_VARIANCE = _moments()
 """Volume [C], centre of mass [C, 3] from the middle of the bounding box, variance about it [C, 3]."""
 _RINGS, CORNERS_USED = _rings()
 UNIT_VERTICES = _RINGS - UNIT_CENTER_OF_MASS[:, None, None] * (CORNERS_USED > 0)[..., None, None]
-"""[C, P, 2K, 3]: corners from the centre of mass."""
+"""Corners of every part, from the centre of mass, of shapes of size 1: [C, P, 2K, 3]."""
 AXIS = np.array([_SECTIONS[name][0] for name in CLASSES], np.int32)
 """Extrusion axis of each class: 0, 1, 2 for x, y, z."""
 
 
 def _sides() -> np.ndarray:
-    """For each ring edge [C, P, K] the first ring edge with the same plane: itself, or 0 for a repeated corner."""
+    """Return for each ring edge [C, P, K] the first ring edge in the same plane: itself, or 0 for a repeated corner."""
     side = np.tile(np.arange(CORNERS), (len(CLASSES), PARTS, 1))
     repeated = (side >= CORNERS_USED[..., None] - 1) & (side < CORNERS - 1)
     return np.where(repeated, 0, side)
 
 
 SIDES = _sides()
+"""For each ring edge [C, P, K] the first ring edge in the same plane: itself, or 0 for a repeated corner."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +167,7 @@ COLORS_RGB = (
 )
 
 MAX_DIAGONAL = 0.126
-"""Metres: no bounding box is longer, so that an object fits a 64 pixel window however it lies."""
+"""Longest diagonal of a bounding box in metres: such an object fits a window of 64 pixels in any pose."""
 
 
 @flax.struct.dataclass
@@ -175,7 +181,7 @@ class Hull(Pytree):
 
 
 def hull(shape: Int[Array, ""] | int, size: Float[Array, " 3"]) -> Hull:
-    """The parts of an object.
+    """Return the convex parts of an object.
 
     Args:
       shape: index into CLASSES; a negative one gives no part.
@@ -201,14 +207,14 @@ def hull(shape: Int[Array, ""] | int, size: Float[Array, " 3"]) -> Hull:
 
 
 def volume(shape: Int[Array, "*b"], size: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
-    """Volume in cubic metres of shapes with bounding boxes of `size` metres."""
+    """Return the volume in cubic metres of shapes with bounding boxes of `size` metres."""
     return UNIT_VOLUME[np.maximum(shape, 0)] * np.prod(size, axis=-1)
 
 
 def inertia(
     shape: Int[Array, ""] | int, size: Float[Array, " 3"], mass: Float[Array, ""] | float
 ) -> Float[Array, " 3"]:
-    """Diagonal inertia (kg m^2) about the centre of mass.
+    """Return the diagonal inertia (kg m^2) about the centre of mass.
 
     Every class has two planes of symmetry, so its inertia is diagonal in its own axes.
     """
@@ -217,7 +223,7 @@ def inertia(
 
 
 def radius(shape: Int[Array, "*b"], size: Float[Array, "*b 3"]) -> Float[jax.Array, "*b"]:
-    """Radius (metres) of a ball about the centre of mass that holds the object."""
+    """Return the radius (metres) of a ball about the centre of mass that contains the object."""
     offset = jnp.asarray(UNIT_CENTER_OF_MASS, jnp.float32)[jnp.maximum(shape, 0)] * size
     return jnp.linalg.norm(size, axis=-1) / 2 + jnp.linalg.norm(offset, axis=-1)
 
@@ -225,7 +231,7 @@ def radius(shape: Int[Array, "*b"], size: Float[Array, "*b 3"]) -> Float[jax.Arr
 def lowest_corner(
     shape: Int[Array, "*b"], size: Float[Array, "*b 3"], poses: Float[Array, "*b 7"], *, xp: Any = jnp
 ) -> Float[Array, "*b"]:
-    """Height (metres) of the lowest corner of objects.
+    """Return the height (metres) of the lowest corner of objects.
 
     `xp` is `jax.numpy`, or `numpy` where the number of objects changes from call to call.
     """

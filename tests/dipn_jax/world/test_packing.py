@@ -43,6 +43,6 @@ def test_a_share_of_scenes_is_packed() -> None:
 
 def test_more_objects_than_stand_in_rows_are_refused() -> None:
     ranges = Ranges(packed=0.1)
-    assert scenes.parse_objects("3:12", ranges=ranges).slots == packing.MOST
+    assert scenes.parse_objects("3:12", ranges=ranges).slots == packing.MAX_OBJECTS
     with pytest.raises(UserError, match=r"--packed with up to 13 objects: no more than 12"):
         scenes.parse_objects("13", ranges=ranges)
