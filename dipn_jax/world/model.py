@@ -148,7 +148,7 @@ def mjcf(
       config: solver settings.
       gripper: dimensions and gains.
       generic: placeholder geometry in every part (see the module's docstring).
-      alike: add meshes that nothing uses, so that models of all scenes with the same number of slots are laid out alike.
+      alike: add meshes that nothing uses, so that models of all scenes with as many slots are laid out alike.
 
     Returns:
       XML text. qpos is `[x, y, z, yaw, left, right, (position, quaternion) of every slot]`.
