@@ -138,7 +138,15 @@ def vs_pybullet(setting: Setting) -> Iterator[tuple[str, float]]:
     if importlib.util.find_spec("pybullet") is None:
         raise Skipped("PyBullet is not installed; run pip install pybullet (the extra `bench`)")
     count = setting.pick(48, 480)
-    job = Job("push", config(), count, setting.seed, -(-count // 4), 1, "native")
+    job = Job(
+        kind="push",
+        scene=config(),
+        episodes=count,
+        seed=setting.seed,
+        shard_size=-(-count // 4),
+        actions=1,
+        engine="native",
+    )
     depth = our_depth(setting.seed + 1, 8 * cores())
     make_data(job)  # compiles
     with multiprocessing.get_context("spawn").Pool(cores()) as pool:

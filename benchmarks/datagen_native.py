@@ -93,7 +93,15 @@ class Replay:
 def share(setting: Setting, kind: str, objects: int) -> float:
     """Seconds of the bare steps over seconds of the data set that they were recorded in."""
     size = setting.pick(96, 480)
-    job = Job(kind, scenes.fixed_count(objects), SHARDS * size, setting.seed, size, ACTIONS[kind], "native")
+    job = Job(
+        kind=kind,
+        scene=scenes.fixed_count(objects),
+        episodes=SHARDS * size,
+        seed=setting.seed,
+        shard_size=size,
+        actions=ACTIONS[kind],
+        engine="native",
+    )
     with recording() as tapes:  # also compiles what JAX has to
         make_data(job)
     tapes = [tape for tape in tapes if tape.start is not None]

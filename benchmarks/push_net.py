@@ -38,7 +38,18 @@ def _task(folder: str, preset: str, seed: int) -> PushTask:
     """A training task on a small data set of 1 to 7 objects."""
     data = pathlib.Path(folder) / "data"
     with quiet():
-        generate(Job("push", scenes.parse_objects("paper"), 72, seed, 72, 3, "native"), data)
+        generate(
+            Job(
+                kind="push",
+                scene=scenes.parse_objects("paper"),
+                episodes=72,
+                seed=seed,
+                shard_size=72,
+                actions=3,
+                engine="native",
+            ),
+            data,
+        )
     return PushTask(data, DipnConfig(preset=preset), limit=None, centimetres=tuple(range(1, 11)))
 
 

@@ -48,7 +48,9 @@ def rate(engine: EngineName, kind: str, objects: int, episodes: int, seed: int) 
     """Episodes on disk a second; what JAX compiles is not counted."""
     scene = scenes.parse_objects(str(objects))
     shard = -(-episodes // (4 if engine == "native" else 2))
-    job = generate.Job(kind, scene, episodes, seed, shard, ACTIONS[kind], engine)
+    job = generate.Job(
+        kind=kind, scene=scene, episodes=episodes, seed=seed, shard_size=shard, actions=ACTIONS[kind], engine=engine
+    )
     with _engine_kept(engine):
         make_data(job)
         return episodes / seconds(lambda: make_data(job))

@@ -50,7 +50,15 @@ def image_bytes(episodes: PushEpisode, count: int) -> float:
 def vs_images(setting: Setting) -> Iterator[tuple[str, float]]:
     """Bytes of a push episode, its share of the metadata included, over those of its images."""
     episodes = setting.pick(200, 1000)
-    job = Job("push", scenes.fixed_count(OBJECTS), episodes, setting.seed, min(episodes, 500), 3, "native")
+    job = Job(
+        kind="push",
+        scene=scenes.fixed_count(OBJECTS),
+        episodes=episodes,
+        seed=setting.seed,
+        shard_size=min(episodes, 500),
+        actions=3,
+        engine="native",
+    )
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name) / "data"
         with quiet():

@@ -81,8 +81,8 @@ def push(
     from .generate import Job
 
     job = Job(
-        "push",
-        scenes.parse_objects(objects, ranges=ranges),
+        kind="push",
+        scene=scenes.parse_objects(objects, ranges=ranges),
         episodes=episodes,
         seed=seed,
         shard_size=shard_size,
@@ -135,8 +135,8 @@ def grasp(
     from .generate import Job
 
     job = Job(
-        "grasp",
-        scenes.parse_objects(objects, ranges=ranges),
+        kind="grasp",
+        scene=scenes.parse_objects(objects, ranges=ranges),
         episodes=episodes,
         seed=seed,
         shard_size=shard_size,
@@ -192,8 +192,8 @@ def images(
     from .generate import Job
 
     job = Job(
-        "images",
-        scenes.parse_objects(objects, ranges=ranges),
+        kind="images",
+        scene=scenes.parse_objects(objects, ranges=ranges),
         episodes=episodes,
         seed=seed,
         shard_size=shard_size,

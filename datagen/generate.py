@@ -36,7 +36,7 @@ SHARDS_AT_ONCE = 2
 """Shards that are made at the same time: one uses the cores that the other leaves idle."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Job:
     """Everything that determines a data set."""
 

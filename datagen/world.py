@@ -64,7 +64,9 @@ class Trial:
 
     def first(self, count: int) -> Trial:
         """Return the first `count` of them."""
-        return Trial(*(structs.take(x, slice(0, count)) for x in (self.items, self.pushes, self.grasps)))
+        some = slice(0, count)
+        items, pushes = structs.take(self.items, some), structs.take(self.pushes, some)
+        return Trial(items, pushes, structs.take(self.grasps, some))
 
 
 def drops(

@@ -15,6 +15,7 @@ They are imported when they are first used, so `import dipn_jax` by itself costs
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -70,6 +71,8 @@ _HOME = {name: f"dipn_jax.{module}" for module, names in _MODULES.items() for na
 
 def __getattr__(name: str) -> Any:
     """Import a public name from its module when it is first used, and return it."""
+    if name == "__version__":
+        return importlib.metadata.version("dipn-jax")
     if name not in _HOME:
         raise AttributeError(f"module 'dipn_jax' has no attribute {name!r}; it has {', '.join(__all__)}")
     value = getattr(importlib.import_module(_HOME[name]), name)

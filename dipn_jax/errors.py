@@ -6,8 +6,9 @@ from __future__ import annotations
 class UserError(Exception):
     """Something that the user gave cannot be used; the text says what was given, what is wanted and what to do.
 
-    try:
-        policy = dipn_jax.load_policy("vpg")
-    except dipn_jax.UserError as error:
-        print(error)        # --method vpg: wants --value-net; give a run of dipn-train baseline
+    Example:
+      try:
+          policy = dipn_jax.load_policy("vpg")
+      except dipn_jax.UserError as error:
+          print(error)        # --method vpg: wants --value-net; give a run of dipn-train baseline
     """

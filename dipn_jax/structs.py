@@ -11,7 +11,7 @@ toward +y. Maps are indexed `[row, col]`, row along +y and col along +x.
 from __future__ import annotations
 
 import enum
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
 
 import flax.struct
 import jax
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 else:
     Array = jax.Array | np.ndarray | np.generic  # an entry of an np.ndarray is an np.generic
 """A jax.Array on the device, an np.ndarray on the host: every type below serves both."""
+
+T = TypeVar("T")
 
 ABSENT = -1
 """Value of `Scene.shape` in an empty slot."""
@@ -75,11 +77,11 @@ class Fault(enum.IntFlag):
 class Pytree:
     """Base of every struct: `replace` (added by `flax.struct.dataclass`), and indexing along the leading axis."""
 
-    def replace(self, **changes: Any) -> Any:
+    def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields replaced."""
         raise NotImplementedError
 
-    def __getitem__(self, index: Any) -> Any:
+    def __getitem__(self, index: Any) -> Self:
         """Return row `index` of a batched struct, or the rows of a slice or an index array."""
         return jax.tree.map(lambda leaf: leaf[index], self)
 
@@ -88,8 +90,9 @@ class Pytree:
 class Scene(Pytree):
     """The objects on the table, without their poses.
 
-    names, scenes, poses = dipn_jax.load_cases()    # a dipn_jax.Scene with a leading axis
-    scenes[0].replace(friction=np.full(6, 0.2))
+    Example:
+      names, scenes, poses = dipn_jax.load_cases()    # a dipn_jax.Scene with a leading axis
+      scenes[0].replace(friction=np.full(6, 0.2))
     """
 
     shape: Int[Array, "*b N"]  # index into shapes.CLASSES, ABSENT where the slot is empty
@@ -103,7 +106,8 @@ class Scene(Pytree):
 class Observation(Pytree):
     """What the camera sees from straight above, orthographic.
 
-    observation = dipn_jax.Observation(height, color, label, slots=10)
+    Example:
+      observation = dipn_jax.Observation(height, color, label, slots=10)
     """
 
     height: Float[Array, "*b H W"]  # metres above the table
@@ -116,7 +120,8 @@ class Observation(Pytree):
 class Push(Pytree):
     """A straight horizontal sweep with the closed gripper.
 
-    push = dipn_jax.Push(start=np.array([-0.1, 0.0]), angle=np.float32(0.0), distance=np.float32(0.1))
+    Example:
+      push = dipn_jax.Push(start=np.array([-0.1, 0.0]), angle=np.float32(0.0), distance=np.float32(0.1))
     """
 
     start: Float[Array, "*b 2"]  # metres, workspace: where the gripper comes down
@@ -128,7 +133,8 @@ class Push(Pytree):
 class Grasp(Pytree):
     """A top-down grasp.
 
-    grasp = dipn_jax.Grasp(center=np.array([0.0, 0.05]), angle=np.float32(0.0), height=np.float32(0.02))
+    Example:
+      grasp = dipn_jax.Grasp(center=np.array([0.0, 0.05]), angle=np.float32(0.0), height=np.float32(0.02))
     """
 
     center: Float[Array, "*b 2"]  # metres, workspace: midpoint between the fingers
@@ -210,8 +216,9 @@ class Candidates(Pytree):
 class Decision(Pytree):
     """The action chosen on one table, and what it was compared with.
 
-    decision = policy(key, observation)             # a dipn_jax.Decision
-    action = decision.push if decision.is_push else decision.grasp
+    Example:
+      decision = policy(key, observation)             # a dipn_jax.Decision
+      action = decision.push if decision.is_push else decision.grasp
     """
 
     is_push: Bool[Array, "*b"]
@@ -233,22 +240,22 @@ class Decision(Pytree):
         return brief
 
 
-def concatenate(batches: list[Any]) -> Any:
+def concatenate(batches: list[T]) -> T:
     """Join structs along their leading axis, as NumPy arrays."""
     return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *batches)
 
 
-def take(episodes: Any, index: np.ndarray | slice | int) -> Any:
+def take(episodes: T, index: np.ndarray | slice | int) -> T:
     """Return the episodes `index` of a batched struct, as NumPy arrays."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[index], episodes)
 
 
-def stack(items: list[Any]) -> Any:
+def stack(items: list[T]) -> T:
     """Stack structs of one kind along a new leading axis, as NumPy arrays."""
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *items)
 
 
-def cast(items: Any) -> Any:
+def cast(items: T) -> T:
     """Return a copy as NumPy arrays, with every floating-point leaf as float32."""
 
     def one(leaf: Any) -> np.ndarray:

@@ -39,7 +39,16 @@ def settled(engine: Any) -> Any:
 
 
 def _job(kind: str, episodes: int, actions: int) -> Job:
-    return Job(kind, scenes.fixed_count(3, spread=0.2), episodes, 0, 16, actions, "native", None)
+    return Job(
+        kind=kind,
+        scene=scenes.fixed_count(3, spread=0.2),
+        episodes=episodes,
+        seed=0,
+        shard_size=16,
+        actions=actions,
+        engine="native",
+        timestep=None,
+    )
 
 
 @pytest.fixture(scope="session")

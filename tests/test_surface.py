@@ -1,16 +1,28 @@
 """The public names: what `import dipn_jax` offers, and what it does not do."""
 
 import importlib
+import inspect
+import itertools
 import os
+import pathlib
 import subprocess
 import sys
+import textwrap
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from flax import nnx
 
 import dipn_jax
+from dipn_jax.networks.dipn import DipnConfig
+from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.planning import predictors
+from dipn_jax.storage import checkpoint
+from dipn_jax.world.cases import hard_cases_path
+
+DIPN = DipnConfig(width=8)
 
 
 def test_every_public_name_exists_and_shows_its_use() -> None:
@@ -21,6 +33,36 @@ def test_every_public_name_exists_and_shows_its_use() -> None:
         home = importlib.import_module(dipn_jax._HOME[name])
         assert getattr(home, name) is item
         assert item.__doc__ and f"dipn_jax.{name}" in item.__doc__, f"{name}: its docstring shows no use"
+
+
+def _snippet(text: str) -> str:
+    """Return the code of a docstring's section `Example`."""
+    lines = inspect.cleandoc(text).split("Example:\n")[1].splitlines()
+    return textwrap.dedent("\n".join(itertools.takewhile(lambda line: not line or line.startswith(" "), lines)))
+
+
+@pytest.mark.parametrize("name", dipn_jax.__all__)
+def test_the_use_that_a_docstring_shows_runs(
+    name: str, settled: Any, data: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a reader would type it, with what the text before it has made."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").symlink_to(data["push"].parent)
+    model = checkpoint.build("grasp", GraspConfig(width=8, coarse=8, blocks=1))
+    parts = {"model": nnx.state(model)}
+    checkpoint.save(tmp_path / "runs/gn", 1, parts, network="grasp", config=model.config, extra={})
+    checkpoint.save(tmp_path / "runs/dipn", 1, {"model": nnx.state(checkpoint.build("dipn", DIPN))},
+                    network="dipn", config=DIPN, extra={})  # fmt: skip
+    (tmp_path / "mine.json").write_bytes(hard_cases_path().read_bytes())
+    observation = dipn_jax.render(settled.scene[0], settled.poses[0])
+    known = {
+        "dipn_jax": dipn_jax, "jax": jax, "np": np, "key": jax.random.key(0), "observation": observation,
+        "motion": np.zeros((5, 3), np.float32), "predictor": predictors.static_predictor,
+        "scorer": lambda images: images[:, None, :, :, 3].repeat(16, 1),
+        "height": observation.height, "color": observation.color, "label": observation.label,
+        "policy": dipn_jax.load_policy("gn"),
+    }  # fmt: skip
+    exec(_snippet(getattr(dipn_jax, name).__doc__), known)
 
 
 def test_another_name_is_an_error_that_lists_them() -> None:

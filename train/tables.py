@@ -54,7 +54,7 @@ class Tables:
             self.spare = structs.concatenate([self.spare, _draw(engine, config, self.seed, self.drawn, len(good))])
             self.drawn += 1
         fresh, self.spare = (structs.take(self.spare, part) for part in (slice(0, len(over)), slice(len(over), None)))
-        self.poses = _replaced(over, poses, fresh.poses)
+        self.poses = _replaced(over, poses, np.asarray(fresh.poses))
         self.scene = jax.tree.map(functools.partial(_replaced, over), scene, fresh.scene)
         self.idle = np.where(again, 0, idle)
         return again
@@ -64,7 +64,7 @@ def begin(engine: Engine, config: SceneConfig, *, count: int, seed: int) -> Tabl
     """Return `count` fresh tables."""
     drawn = _draw(engine, config, seed, 0, count)
     first, spare = structs.take(drawn, slice(0, count)), structs.take(drawn, slice(count, None))
-    return Tables(first.scene, first.poses, spare, seed, idle=np.zeros(count, int))
+    return Tables(first.scene, np.asarray(first.poses), spare, seed, idle=np.zeros(count, int))
 
 
 def _draw(engine: Engine, config: SceneConfig, seed: int, batch: int, count: int) -> SettledScene:

@@ -82,8 +82,9 @@ def resolve(name: EngineName) -> EngineName:
 def make_engine(name: EngineName, *, timestep: float | None = None, sleep: float | None = None) -> Engine:
     """Make the engine called `name`, with its own solver settings unless others are given.
 
-        engine = dipn_jax.make_engine("native")
-        rollout = dipn_jax.world.primitives.push(engine, scenes, poses, pushes)
+    Example:
+      engine = dipn_jax.make_engine("native")
+      tables = dipn_jax.settled_scenes(jax.random.key(0), engine, dipn_jax.SceneConfig(), 2)
 
     Making `mjx` patches MuJoCo MJX in the whole process (`physics.patches`); models of other code that uses MJX in the
     process are passed on to MJX's own functions. `native` and `warp` patch nothing.

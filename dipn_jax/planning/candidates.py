@@ -99,7 +99,7 @@ def stays_inside(
     before = geometry.metres_to_pixels(centers)
     low, high = CENTER_RANGE
     out = ((pixel < low) & (pixel < before)) | ((pixel > high) & (pixel > before))
-    return ~(out.any(-1) & (area > 0)).any()
+    return ~jnp.any(out.any(-1) & (area > 0))
 
 
 def grasp_at(index: Int[Array, "*b 3"], height: Float[Array, "H W"]) -> Grasp:
@@ -199,12 +199,10 @@ def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) ->
 
 
 def best_grasps(scores: Float[Array, "R H W"], *, count: int, apart: float = 8.0) -> Int[jax.Array, "{count} 3"]:
-    """Return the `count` best of scores `[16, H, W]` that are at least `apart` pixels from one another: `[count,
-    3]`.
-    """
+    """Return the `count` best grasps by score, at least `apart` pixels from one another."""
     grid = geometry.view_grid(*scores.shape[1:])
 
-    def next_best(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+    def next_best(left: Array, _: None) -> tuple[Array, jax.Array]:
         index = best_grasp(left)[0]
         near = jnp.linalg.norm(grid - index[::-1][:2], axis=-1) < apart
         return jnp.where(near, -1.0, left), index

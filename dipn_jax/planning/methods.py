@@ -1,6 +1,6 @@
 """The methods that clear tables: a registry of what each needs and how it is built. `load_policy` builds one.
 
-A new method is one entry of `METHODS`.
+A new method is an entry of `METHODS`, and its name one of `names.MethodName`, which the commands list without JAX.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import pathlib
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Key
@@ -31,9 +30,9 @@ ROLES: dict[NetworkRole, tuple[str, str]] = {
 }
 """What a network does in a method -> its name in checkpoints, and the dipn-train command that trains it."""
 LONGEST_PUSH = 0.12
-"""Longest push in metres."""
+"""Length in metres of the longest push: simulated and learnt pushes of 10 cm, and a little beyond."""
 
-Act = Callable[[jax.Array, Observation, Array, Rule, Array], Decision]
+Act = Callable[[Array, Observation, Array, Rule, Array], Decision]
 """(key, observation, grasps that missed [M, 3], rule, distances of the candidates [P] metres) -> decision."""
 
 
@@ -118,7 +117,10 @@ class Networks:
         needed = find(method).networks
         for role in needed:
             if getattr(self, role) is None:
-                raise UserError(f"--method {method}: wants --{role}-net; give a run of dipn-train {ROLES[role][1]}")
+                builtin = "" if role == "value" else ", or builtin"
+                raise UserError(
+                    f"--method {method}: wants --{role}-net; give a run of dipn-train {ROLES[role][1]}{builtin}"
+                )
         return {role: checkpoint.find(getattr(self, role), network=ROLES[role][0]) for role in needed}
 
 
@@ -143,8 +145,9 @@ def load_policy(
 ) -> Policy:
     """Load the policy of a method, with the networks that come with the package or with your own.
 
-        policy = dipn_jax.load_policy("dipn+gn", push_net="runs/dipn")
-        decision = policy(jax.random.key(0), observation)
+    Example:
+      policy = dipn_jax.load_policy("dipn+gn", push_net="runs/dipn")
+      decision = policy(jax.random.key(0), observation)
 
     Args:
       method: a name of `METHODS`.
@@ -173,7 +176,7 @@ def grasping_policy(scorer: Scorer) -> Policy:
 def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSummary | None) -> Act:
     """Build the policy of Alg. 2: imagine the image after every candidate push."""
 
-    def act(key: jax.Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
+    def act(key: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
         count = len(distances)
         return planner.decide(
             key, seen, predictor, scorer, count=count, distance=distances, rule=rule, summarize=summarize, missed=missed
@@ -191,7 +194,7 @@ def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Ac
       grasp_at_once: whether the rule's `grasp_above` holds.
     """
 
-    def act(_: jax.Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
+    def act(_: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
         above = rule.grasp_above if grasp_at_once else jnp.inf
         return planner.decide_by_value(
             seen, push_scorer, scorer, distance=distances[0], grasp_above=above, missed=missed

@@ -40,7 +40,8 @@ UNDRAWN_TURN = np.deg2rad(1.0)
 class Rule(Pytree):
     """How Alg. 2 decides; every field is traced. The defaults are the paper's rule.
 
-    decision = dipn_jax.decide(key, observation, predictor, scorer, rule=dipn_jax.Rule(gamma=0.8))
+    Example:
+      decision = dipn_jax.decide(key, observation, predictor, scorer, rule=dipn_jax.Rule(gamma=0.8))
     """
 
     gamma: Float[Array, ""] | float = 0.9  # discount of a push's value
@@ -126,7 +127,7 @@ def decide_among(
         )
 
     images = jax.lax.map(imagined, (drawn, allowed))
-    means, highest = summarize(now, images, allowed)
+    means, highest = summarize(now, images, jnp.asarray(allowed))
     mean, top = means[1:], highest[1:]
     value_now = jnp.where(allowed.any(), means[0], found.value_now)
     taken = allowed & (~jnp.asarray(rule.push_must_raise_best) | ((top > highest[0]) & (mean > means[0])))
@@ -163,8 +164,11 @@ def decide(
 ) -> Decision:
     """Choose between the best grasp and the best push (Alg. 2 of the paper).
 
-        predictor, scorer = policy.load_predictor("builtin"), policy.load_scorer("builtin")
-        decision = dipn_jax.decide(jax.random.key(0), observation, predictor, scorer)
+    Example:
+      from dipn_jax.planning import predictors, scorers
+
+      predictor, scorer = predictors.load_predictor("builtin"), scorers.load_scorer("builtin")
+      decision = dipn_jax.decide(jax.random.key(0), observation, predictor, scorer)
 
     Args:
       key: random key, for the candidates.

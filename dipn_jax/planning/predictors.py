@@ -25,7 +25,7 @@ def static_predictor(observation: Observation, pushes: Push) -> Float[jax.Array,
 def trans_predictor(observation: Observation, pushes: Push) -> Float[jax.Array, "P N 3"]:
     """Predict that only the pushed object moves, by the push length along the push: a baseline, a Predictor."""
 
-    def one(label: jax.Array, push: Push) -> jax.Array:
+    def one(label: Array, push: Push) -> jax.Array:
         hit = imagine.move_toward(label, push.start, push.angle)
         shift = push.distance * jnp.stack([jnp.cos(push.angle), jnp.sin(push.angle), jnp.zeros(())])
         return jnp.where(((jnp.arange(observation.slots) == hit) & (hit != ABSENT))[:, None], shift, 0.0)

@@ -19,8 +19,11 @@ WINDOW = 80
 def imagine(observation: Observation, centers: Float[Array, "N 2"], motion: Float[Array, "N 3"]) -> Observation:
     """Predict the observation after every object has moved rigidly in the plane.
 
-        centers, _ = dipn_jax.sight.masks.mask_centers(observation.label, observation.slots)
-        after = dipn_jax.imagine(observation, centers, motion)
+    Example:
+      from dipn_jax.sight import masks
+
+      centers, _ = masks.mask_centers(observation.label, observation.slots)
+      after = dipn_jax.imagine(observation, centers, motion)
 
     Args:
       observation: maps before, 224 x 224.

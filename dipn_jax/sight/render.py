@@ -114,9 +114,10 @@ def render_depth(
 def render(scene: Scene, poses: Float[Array, "N 7"], *, pixels: int = WORKSPACE.pixels) -> Observation:
     """Render what the camera sees of one scene; arguments as `render_depth`.
 
-    names, scenes, poses = dipn_jax.load_cases()
-    observation = dipn_jax.render(scenes[0], poses[0])
-    every = jax.vmap(dipn_jax.render)(scenes, poses)
+    Example:
+      names, scenes, poses = dipn_jax.load_cases()
+      observation = dipn_jax.render(scenes[0], poses[0])
+      every = jax.vmap(dipn_jax.render)(scenes, poses)
     """
     height, label = render_depth(scene, poses, pixels=pixels)
     return Observation(height, paint_labels(label, scene.color), label, scene.shape.shape[0])

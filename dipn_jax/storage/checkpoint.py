@@ -203,8 +203,9 @@ def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
 def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Module:
     """Load the network of the newest whole step of a run, in evaluation mode.
 
-        dipn = dipn_jax.load_network(network="dipn")             # comes with the package
-        mine = dipn_jax.load_network("runs/gn", network="grasp")
+    Example:
+      dipn = dipn_jax.load_network(network="dipn")             # comes with the package
+      mine = dipn_jax.load_network("runs/gn", network="grasp")
 
     Args:
       run: a run's folder, or `builtin`.

@@ -14,6 +14,7 @@ import numpy as np
 from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import shards
+from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 
 MANIFEST = "manifest.json"
 """Name of the file that lists the shards of a data set."""
@@ -136,12 +137,13 @@ def summary(folder: pathlib.Path) -> dict[str, Any]:
     }
 
 
-def read_episodes(folder: pathlib.Path | str) -> Any:
+def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | SettledScene:
     """Read a whole data set: a PushEpisode, GraspEpisode or SettledScene with a leading `[B]`, as numpy.
 
-        pushes = dipn_jax.read_episodes("data/push")
-        pushes.poses.shape                                       # [B, 11, N, 7]: at every centimetre of each push
-        observation = dipn_jax.render(pushes.scene[0], pushes.poses[0, 0])
+    Example:
+      pushes = dipn_jax.read_episodes("data/push")
+      pushes.poses.shape                                       # [B, 11, N, 7]: at every centimetre of each push
+      observation = dipn_jax.render(pushes.scene[0], pushes.poses[0, 0])
 
     Args:
       folder: what `dipn-datagen push`, `grasp` or `images` wrote.
@@ -150,6 +152,7 @@ def read_episodes(folder: pathlib.Path | str) -> Any:
       UserError: there is no data set, or a shard of it is damaged.
     """
     folder = pathlib.Path(folder)
+    episodes: PushEpisode | GraspEpisode | SettledScene
     episodes, _ = load(folder, kind=str(summary(folder)["kind"]))
     return episodes
 

@@ -28,9 +28,10 @@ def load_cases(
 ) -> tuple[list[str], Scene, Float[np.ndarray, "C N 7"]]:
     """Read a case file: hand-placed scenes in the format of `hard_cases.json`.
 
-        names, scenes, poses = dipn_jax.load_cases()             # the ten hard tables
-        names, scenes, poses = dipn_jax.load_cases("mine.json")
-        observation = dipn_jax.render(scenes[0], poses[0])
+    Example:
+      names, scenes, poses = dipn_jax.load_cases()             # the ten hard tables
+      names, scenes, poses = dipn_jax.load_cases("mine.json")
+      observation = dipn_jax.render(scenes[0], poses[0])
 
     Args:
       path: JSON file with `cases`, each a name and a list of objects; by default the ten hard tables of the paper.

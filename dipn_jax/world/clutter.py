@@ -44,9 +44,10 @@ def settled(
 def settled_scenes(key: Key[Array, ""], engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
     """Drop random objects until `count` scenes have come to rest.
 
-        engine, config = dipn_jax.make_engine("native"), dipn_jax.SceneConfig()
-        tables = dipn_jax.settled_scenes(jax.random.key(0), engine, config, 16)
-        observation = dipn_jax.render(tables.scene[0], tables.poses[0])
+    Example:
+      engine, config = dipn_jax.make_engine("native"), dipn_jax.SceneConfig()
+      tables = dipn_jax.settled_scenes(jax.random.key(0), engine, config, 16)
+      observation = dipn_jax.render(tables.scene[0], tables.poses[0])
 
     Raises:
       UserError: `MAX_DROPS` drops in a row gave none.

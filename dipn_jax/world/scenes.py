@@ -36,7 +36,8 @@ NOMINAL_FRICTION = 0.35
 class SceneConfig:
     """How random scenes are drawn.
 
-    config = dipn_jax.SceneConfig(slots=10, counts=(0.1,) * 10)   # 1 to 10 objects, all as likely
+    Example:
+      config = dipn_jax.SceneConfig(slots=10, counts=(0.1,) * 10)   # 1 to 10 objects, all as likely
     """
 
     slots: int = 7  # padded number of objects

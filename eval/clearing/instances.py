@@ -84,7 +84,7 @@ def hard_instances(
 def random_instances(engine: Engine, config: scenes.SceneConfig, *, count: int, seed: int) -> list[Instance]:
     """`count` random settled scenes."""
     items = clutter.settled_scenes(jax.random.key(seed), engine, config, count)
-    return _instances([f"random-{i}" for i in range(count)], items.scene, items.poses)
+    return _instances([f"random-{i}" for i in range(count)], items.scene, np.asarray(items.poses))
 
 
 def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instance]:

@@ -76,8 +76,9 @@ def clear(
                 if len(which):
                     act([rows[i] for i in which], decision[which], engine)
             for i, instance in enumerate(rows):
-                _record(instance, (scene.shape[i], poses[i]), decision[i])
-                _update_missed(instance, (scene.shape[i], poses[i]), decision.grasp_pixel[i])
+                state = np.asarray(scene.shape[i]), poses[i]
+                _record(instance, state, decision[i])
+                _update_missed(instance, state, np.asarray(decision.grasp_pixel[i]))
                 instance.ended = instance.ended or _ended(instance)
             partial.save(instances)
             removed = sum(instance.removed for instance in instances) - before
@@ -118,9 +119,9 @@ def _record(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: 
             "shape": state[0],
             "poses": state[1],
             "push": np.array([*push.start, push.angle, push.distance], np.float32),
-            "grasp": decision.grasp_pixel,
+            "grasp": np.asarray(decision.grasp_pixel),
             "values": np.array([decision.grasp_score, decision.value_now, decision.value_push], np.float32),
-            "motion": decision.motion.astype(np.float32),
+            "motion": np.asarray(decision.motion, np.float32),
         }
     )
 

@@ -12,7 +12,16 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import records, shards
 from dipn_jax.world import scenes
 
-JOB = Job("push", scenes.fixed_count(3, spread=0.2), 24, 0, 16, 4, "native", None)
+JOB = Job(
+    kind="push",
+    scene=scenes.fixed_count(3, spread=0.2),
+    episodes=24,
+    seed=0,
+    shard_size=16,
+    actions=4,
+    engine="native",
+    timestep=None,
+)
 
 
 @pytest.fixture
