@@ -199,9 +199,7 @@ def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) ->
 
 
 def best_grasps(scores: Float[Array, "R H W"], *, count: int, apart: float = 8.0) -> Int[jax.Array, "{count} 3"]:
-    """Return the `count` best of scores `[16, H, W]` that are at least `apart` pixels from one another: `[count,
-    3]`.
-    """
+    """Return the `count` best of scores `[16, H, W]`, at least `apart` pixels from one another: `[count, 3]`."""
     grid = geometry.view_grid(*scores.shape[1:])
 
     def next_best(left: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:

@@ -64,8 +64,8 @@ def _off_table(image: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 
 def _regions(image: np.ndarray, foreground: np.ndarray) -> np.ndarray:
-    """Label connected areas of one colour `[H, W]` with 1, 2, ...; 0 elsewhere. Each grows from the middle of what
-    is left.
+    """Label connected areas of one colour `[H, W]` with 1, 2, ..., each grown from the middle of what is left; else
+    0.
     """
     regions = np.zeros(foreground.shape, np.int32)
     left = foreground.astype(np.uint8)
@@ -97,9 +97,7 @@ def _join(regions: np.ndarray, image: np.ndarray, height: np.ndarray) -> np.ndar
 
 
 def _bridged(first: np.ndarray, second: np.ndarray, height: np.ndarray) -> bool:
-    """Return whether the shortest line between two masks is short and passes under something higher than both of
-    them.
-    """
+    """Return whether the shortest line between two masks is short and passes under something higher than both."""
     if not first.any() or not second.any():
         return False
     far, nearest = cv2.distanceTransformWithLabels(

@@ -68,9 +68,7 @@ def push_trajectory(push: Push) -> Trajectory:
 
 
 def push_samples(*, longest: float = PUSH_STEPS * 0.01) -> Float[np.ndarray, " 12"]:
-    """Return the sampled times in seconds: at each centimetre of travel up to 10, and at rest after `longest`
-    metres.
-    """
+    """Return the sampled times in seconds: at each centimetre up to 10, and at rest after `longest` metres."""
     begin = DESCEND_TIME + 0.1
     travel = begin + np.arange(PUSH_STEPS + 1) * 0.01 / PUSH_SPEED
     return np.append(travel, begin + longest / PUSH_SPEED + 0.1 + DESCEND_TIME + REST_TIME)

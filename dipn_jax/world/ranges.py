@@ -10,9 +10,7 @@ from dipn_jax.errors import UserError
 Range: TypeAlias = tuple[float, float]
 """Smallest and largest value."""
 BOUNDS = {"scale": (0.5, 1.2), "density": (10.0, 25_000.0), "friction": (0.01, 5.0)}
-"""Smallest and largest value allowed in each range: cork to platinum; what the renderer's window and the fingers'
-height allow.
-"""
+"""Smallest and largest value allowed in each range, by what camera and fingers allow; densities of cork to platinum."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,7 +44,7 @@ def _half_disc() -> Polygon:
 
 
 def _notched() -> list[Polygon]:
-    """Return the arch in (z, x): a 26 mm half-round notch in a 100 x 50 mm face, as a trapezoid of equal area and
+    """Return the arch in (z, x): a 100 x 50 mm face whose 26 mm half-round notch is a trapezoid of equal area and
     depth.
     """
     rim, floor, depth = 0.26, 0.148, 0.02  # of 100 mm, of 100 mm, and x = -1 mm of 50 mm

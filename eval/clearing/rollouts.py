@@ -1,4 +1,4 @@
-"""Decisions with the engine itself as predictor: the ceiling of imagination (`physics+gn`)."""
+"""Decisions with the engine itself as predictor (`physics+gn`): no predictor can be better."""
 
 from __future__ import annotations
 

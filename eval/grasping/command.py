@@ -1,4 +1,4 @@
-"""`dipn-eval grasp`."""
+"""The command `dipn-eval grasp`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def grasp(
     engine: EngineName = "auto",
     ranges: Ranges = DEFAULT_RANGES,
 ) -> None:
-    """Success of the best-scored grasp, over every attempt until the tables are empty; a random grasp beside it.
+    """Measure how often the best-scored grasp holds until the tables are empty, and how often a random one does.
 
       dipn-eval grasp --grasp-net builtin --out results/grasp
 
