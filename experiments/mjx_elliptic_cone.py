@@ -1,4 +1,4 @@
-"""The experiment of docs/mjx-elliptic-cone.md: why MJX's elliptic cones fail in float32, and what mends them.
+"""The experiment of docs/mjx-elliptic-cone.md: why MJX's elliptic cones fail in float32.
 
     python -m experiments.mjx_elliptic_cone
 
