@@ -68,14 +68,14 @@ def push(
       dipn-datagen push --out data/sweep --distances 0.03 0.06 0.1 --shard-size 300
 
     Args:
-      out: folder of the data set; asking again continues or extends it.
-      episodes: how many.
+      out: folder of the data set; the same command continues, more --episodes extend it.
+      episodes: number of episodes.
       objects: number of objects in a scene.
-      seed: seed of everything random.
+      seed: random seed of everything.
       actions: different pushes tried on each settled scene.
       distances: metres, up to 0.1; every push is made once for each of them, from the same settled scene.
       shard_size: episodes in a file; files are the unit of resuming and of sharing work.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
     from dipn_jax.world import scenes
@@ -118,16 +118,16 @@ def grasp(
       dipn-datagen grasp --grasp-net runs/gn-pretrained --out data/guided --episodes 12000
 
     Args:
-      out: folder of the data set; asking again continues or extends it.
-      episodes: how many.
+      out: folder of the data set; the same command continues, more --episodes extend it.
+      episodes: number of episodes.
       objects: number of objects in a scene.
-      seed: seed of everything random.
+      seed: random seed of everything.
       actions: different grasps tried on each settled scene.
       shard_size: episodes in a file.
       grasp_net: run of dipn-train, or builtin; none: all grasps are random.
       guided: share of grasps that it scores high, 0.5 unless given.
       hard: share of grasps that it is unsure of, 0.25 unless given.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
     if grasp_net is None and (guided is not None or hard is not None):
@@ -181,12 +181,12 @@ def images(
       dipn-datagen images --out data/images --episodes 100
 
     Args:
-      out: folder of the data set; asking again continues or extends it.
-      episodes: how many scenes.
+      out: folder of the data set; the same command continues, more --episodes extend it.
+      episodes: number of scenes.
       objects: number of objects in a scene.
-      seed: seed of everything random.
+      seed: random seed of everything.
       shard_size: scenes in a file.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
     from dipn_jax.world import scenes
@@ -220,12 +220,12 @@ def check_world(
       dipn-datagen check-world --out results/world
 
     Args:
-      out: folder for metrics.json and world.md; asking again continues where it stopped.
+      out: folder for metrics.json and world.md; the same command continues where it stopped.
       engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
       scenes_: scenes with a push and a grasp each.
       few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
       tries: grasps of every catalogue item.
-      seed: seed of everything random.
+      seed: random seed of everything.
     """
     from . import check
 

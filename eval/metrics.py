@@ -19,7 +19,7 @@ def ratio_interval(hits: np.ndarray, trials: np.ndarray, *, seed: int = 0) -> tu
     Args:
       hits: `[I]` per instance.
       trials: `[I]` per instance.
-      seed: of the resampling.
+      seed: random seed of the resampling.
 
     Returns:
       Estimate, low, high; NaN where there is no trial.

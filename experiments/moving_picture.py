@@ -186,7 +186,7 @@ def main(
     Args:
       out: the folder that `dipn-eval clear --out` wrote.
       to: the GIF.
-      table: which of its episodes.
+      table: number of the episode.
     """
     shown = film.load(out / "episodes" / f"{table:03d}.npz")
     pictures = [draw(frame) for frame in frames(shown, make_engine("native"))]

@@ -114,9 +114,9 @@ def write(name: str, values: dict[str, Any], tables: Sequence[str], *, docs: pat
     """Write `NAME.json` and put the tables and the box into `NAME.md`, which must have places for them.
 
     Args:
-      name: of the page.
+      name: name of the page.
       values: its JSON.
-      tables: as Markdown.
+      tables: tables as Markdown.
       docs: folder of the page.
     """
     page = docs / f"{name}.md"

@@ -64,7 +64,7 @@ def push(
       preset: architecture.
       limit: learn from this many of the first episodes only; what is held out stays the same.
       centimetres: push distances learnt.
-      without: leave out scenes with an object of these classes, to see how well they are guessed.
+      without: leave out scenes with an object of these classes, to see how well unseen shapes are predicted.
       masks: true: the simulator's; found: cut out of the rendered image by colour and height.
       config: optimizer and schedule.
     """
@@ -141,10 +141,10 @@ def grasp_online(
 
     Args:
       out: run folder; the same command continues where it stopped.
-      init: run to start from (grasp-pretrain's); without it the compact network knows nothing.
+      init: run to start from (grasp-pretrain's); without it the compact network begins with random weights.
       objects: number of objects on a fresh table: 10, or 1:7.
-      engine: physics.
-      config: how much, and how.
+      engine: physics engine.
+      config: amount and schedule of learning.
     """
     console.require_positive(grasps=config.grasps)
     _check(out, config)
@@ -183,8 +183,8 @@ def baseline(
       out: run folder; the same command continues where it stopped.
       grasp_net: run of dipn-train grasp or grasp-online, or builtin, whose grasps dqn takes.
       objects: number of objects on a fresh table: 10, or 1:7.
-      engine: physics.
-      config: method, how much, and how.
+      engine: physics engine.
+      config: method, and amount and schedule of learning.
     """
     console.require_positive(actions=config.actions)
     _check(out, config)
@@ -228,7 +228,7 @@ def export(
     Args:
       run: run folder.
       out: new run folder.
-      network: what is in it.
+      network: the kind of network in it.
     """
     from dipn_jax.storage import checkpoint
 

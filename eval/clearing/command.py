@@ -61,7 +61,7 @@ def clear(
       push_net: run of dipn-train push, or builtin.
       grasp_net: run of dipn-train grasp, or builtin.
       value_net: run of dipn-train baseline.
-      tables: which tables to clear.
+      tables: the tables to clear.
       candidates: pushes considered at a time.
       distance: metres of a push.
       gamma: discount of a push's value.
@@ -72,8 +72,8 @@ def clear(
         a finger would land on something; no: as published. Means of imagined images are always as published.
       remember: halve the scores of grasps like one that missed until something near them moves; no: as published.
       label: for the report, what distinguishes this evaluation from others of its method, such as the data learnt from.
-      seed: of scenes, perturbations and candidates.
-      engine: physics.
+      seed: random seed of scenes, perturbations and candidates.
+      engine: physics engine.
     """
     settings = _settings(locals())
     from dipn_jax.physics import make_engine
@@ -138,13 +138,13 @@ def sweep(
       push_net: run of dipn-train push, or builtin; beyond 10 cm objects continue as in the last centimetre.
       grasp_net: run of dipn-train grasp, or builtin.
       distances: first:last:step, metres, to 0.12.
-      tables: which tables to clear.
+      tables: the tables to clear.
       candidates: pushes considered at a time; the choosing policy gives each of them one of the distances.
       pushes: scenes of 1 to 7 objects, a push in each, for the prediction error; 0: do not measure it.
       gamma: discount of a push's value.
       threshold: grasp at once above this score.
-      seed: of scenes, perturbations and candidates.
-      engine: physics.
+      seed: random seed of scenes, perturbations and candidates.
+      engine: physics engine.
     """
     settings = _settings(locals()) | {"method": "dipn+gn", "label": ""}
     from dipn_jax.physics import make_engine
@@ -239,8 +239,8 @@ def _clear(
     Args:
       out: folder of the results.
       decide: decides on every table.
-      physics: physics.
-      tables: which tables.
+      physics: physics engine.
+      tables: the tables to clear.
       settings: options, for `settings.json`.
       runs: networks that `decide` uses.
       longest: metres of the longest push.

@@ -50,10 +50,10 @@ def clear(
 
     Args:
       instances: settled tables; changed in place, or replaced by those of an interrupted evaluation.
-      engine: physics.
-      decide: what to do next.
+      engine: physics engine.
+      decide: the policy.
       partial: where an interrupted evaluation is kept.
-      seed: of the push candidates.
+      seed: random seed of the push candidates.
       longest: metres of the longest push that `decide` asks for.
       remember: tell `decide` of the grasps that missed around which nothing has moved since.
 

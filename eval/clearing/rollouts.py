@@ -38,7 +38,7 @@ def decide(
       missed: `[B, M, 3]` grasps that missed.
       scorer: scores of every grasp.
       summarize: mean and highest score of all grasps on predicted images.
-      engine: physics.
+      engine: physics engine.
       rule: how to compare.
       distances: `[P]` metres of the candidates.
 

@@ -68,11 +68,11 @@ def prediction_errors(
 
     Args:
       predictor: of `config.slots` objects.
-      engine: what truth is; at rest, the gripper gone.
+      engine: the engine whose result counts as the truth, at rest and without the gripper.
       config: scenes.
       distances: metres.
-      scenes: how many.
-      seed: of scenes and pushes.
+      scenes: number of scenes.
+      seed: random seed of scenes and pushes.
       longest: metres that are simulated, the same for all distances.
 
     Returns:

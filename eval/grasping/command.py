@@ -38,12 +38,12 @@ def grasp(
       out: folder for metrics.json, pictures and every step of every table.
       grasp_net: run of dipn-train grasp, or builtin.
       curve: runs of dipn-train grasp-online of different --seed, with and without --init.
-      scenes_: how many tables.
+      scenes_: number of tables.
       objects: number of objects on a table.
-      seed: of scenes and random grasps; keep it away from the training data's.
+      seed: random seed of scenes and random grasps; keep it away from the training data's.
       others: where a grasp missed, also try this many of the next best ones, to see what physics allows.
-      engine: physics.
-      ranges: what random objects are drawn from.
+      engine: physics engine.
+      ranges: the ranges that random objects are drawn from.
     """
     settings = dict(locals())
     options.check(out, seed, scenes=scenes_)

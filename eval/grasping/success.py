@@ -45,11 +45,11 @@ def evaluate(
 
     Args:
       scorer: scores of every grasp.
-      engine: physics.
+      engine: physics engine.
       config: scenes.
       partial: where an interrupted evaluation is kept.
-      scenes: how many tables.
-      seed: of the scenes and of the random grasps.
+      scenes: number of tables.
+      seed: random seed of the scenes and of the random grasps.
       others: where a grasp missed, how many of the next best to try, each from the same state; 0: none.
 
     Returns:
@@ -147,10 +147,10 @@ def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: i
     """Measure how often the labels of pre-training agree with physics, for random grasps of the foreground.
 
     Args:
-      engine: physics.
+      engine: physics engine.
       config: scenes; one object in each to see what the rule is worth by itself.
-      scenes: how many.
-      seed: of scenes and grasps.
+      scenes: number of scenes.
+      seed: random seed of scenes and grasps.
       each: grasps on every scene.
     """
     items = clutter.settled_scenes(jax.random.key(seed), engine, config, scenes)

@@ -44,11 +44,11 @@ def predict(
       curve: runs of dipn-train push with different --limit and --seed.
       scenes_: number of pushes, one in each scene.
       objects: number of objects in a scene.
-      seed: of scenes and pushes; keep it away from the training data's.
+      seed: random seed of scenes and pushes; keep it away from the training data's.
       engine: the engine whose result counts as the truth.
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
       segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
     """
     settings = dict(locals())
     options.check(out, seed, scenes=scenes_)

@@ -53,11 +53,11 @@ def evaluate(
 
     Args:
       networks: what to measure by the name it gets in the metrics; the first also makes the pictures.
-      engine: what truth is.
+      engine: the engine whose result counts as the truth.
       config: scenes.
       partial: where an interrupted evaluation is kept.
-      scenes: how many.
-      seed: of the scenes and pushes.
+      scenes: number of scenes.
+      seed: random seed of the scenes and pushes.
       physics: also roll the engine out with nominal mass and friction.
       segmented: also measure with masks found in the image.
 
@@ -144,7 +144,7 @@ def measure(
       executed: pushes `[B]` and what they did; `rolled` is measured as the predictor `physics`.
       predictors: what to measure.
       seen: `[B]` what the predictors see.
-      suffix: of the predictors' names.
+      suffix: end of the predictors' names.
     """
     truth, after = executed.truth, executed.labels_after
     centers, motion = batching.in_batches(_true_motion, seen.label, truth)
