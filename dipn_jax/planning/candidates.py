@@ -33,7 +33,7 @@ SAME_GRASP_PIXELS = 10.0
 SAME_GRASP_ROTATIONS = 1
 """Largest difference in rotations (of 16) between two grasps that count as the same grasp."""
 
-_OVERSAMPLE = 4
+_OVERSAMPLE = 4  # pixels of contours drawn for each push
 
 
 @functools.partial(jax.jit, static_argnames="count")

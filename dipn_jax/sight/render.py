@@ -23,7 +23,7 @@ WINDOW = 64
 TABLE_COLOR = (0.2, 0.2, 0.2)
 """RGB of the table."""
 _STEEP = 1e-6  # |n_z| below which a face is taken as vertical
-_FAR = 1e3
+_FAR = 1e3  # metres: minus this is the top of what is not there
 
 
 def _bounds(
