@@ -54,9 +54,9 @@ def load_push_runs(runs: Sequence[pathlib.Path]) -> dict[str, DIPN]:
         plan = run / "config.json"
         planned = files.read_json(plan).get("steps", 0) if plan.exists() else 0
         if planned > meta["step"]:
-            raise UserError(f"--curve {run}: stopped at step {meta['step']} of {planned}; let its command end first")
+            raise UserError(f"--curve {run}: stopped at step {meta['step']} of {planned}; run its command to the end")
         if "examples" not in meta:
-            raise UserError(f"--curve {run}: its checkpoint does not say how many pushes it is of; train again")
+            raise UserError(f"--curve {run}: its checkpoint does not name its number of pushes; train again")
         key = (int(meta["examples"]), int(meta["seed"]))
         if key in found:
             raise UserError(f"--curve {run}: a second run of {key[0]} pushes with seed {key[1]}; give one of each")

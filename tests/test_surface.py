@@ -54,7 +54,7 @@ def test_a_policy_is_loaded_by_its_name(settled: Any) -> None:
     np.testing.assert_array_equal(grasping.grasp_pixel, both.grasp_pixel)
     _, row, col = grasping.grasp_pixel
     assert observation.label[row, col] >= 0, "it grasps an object"
-    with pytest.raises(dipn_jax.UserError, match="--method vpg: wants --value-net"):
+    with pytest.raises(dipn_jax.UserError, match="--method vpg: needs --value-net"):
         dipn_jax.load_policy("vpg")
     with pytest.raises(dipn_jax.UserError, match=r"physics.gn: decides on the simulator's state"):
         dipn_jax.load_policy("physics+gn")

@@ -74,7 +74,7 @@ class PolicyConfig:
     gamma: float = 0.9
     grasp_above: float = 0.7
     released: bool = False  # with the clauses of DIPN's released code
-    cautious: bool = True  # GN's scores are the least of four answers; False: GN as published
+    cautious: bool = True  # GN's scores are the lowest of four mirrored ones; False: GN as published
 
     def rule(self) -> Rule:
         """Return the rule that the planner compares by."""
@@ -118,7 +118,7 @@ class Networks:
         needed = find(method).networks
         for role in needed:
             if getattr(self, role) is None:
-                raise UserError(f"--method {method}: wants --{role}-net; give a run of dipn-train {ROLES[role][1]}")
+                raise UserError(f"--method {method}: needs --{role}-net; give a run of dipn-train {ROLES[role][1]}")
         return {role: checkpoint.find(getattr(self, role), network=ROLES[role][0]) for role in needed}
 
 
@@ -243,7 +243,7 @@ def _chances(run: pathlib.Path) -> Scorer:
     model: Any = checkpoint.load_network(run, network="vpg")
     if model.config.answers != "chance":
         raise UserError(
-            f"--value-net {run}: has learnt values, not chances; give a run of dipn-train baseline --method rea"
+            f"--value-net {run}: predicts values, not chances; give a run of dipn-train baseline --method rea"
         )
     return _part(run, "grasp")
 
@@ -257,7 +257,7 @@ def _part(run: pathlib.Path, name: str) -> Scorer:
     found = scorers.load_values(run)[vpg.PARTS.index(name)]
     if found is None:
         raise UserError(
-            f"--value-net {run}: has not learnt to {name}; give a run of another dipn-train baseline --method"
+            f"--value-net {run}: was not trained to {name}; give a run of another dipn-train baseline --method"
         )
     return found
 

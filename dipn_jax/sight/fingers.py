@@ -45,7 +45,7 @@ def under_fingers(
 ) -> Float[jax.Array, "*b"]:
     """Return the highest point, in metres, that the open fingers of each grasp come down on.
 
-    What reaches the border of the map is taken to go on beyond it.
+    An object that reaches the border of the map is assumed to extend beyond it.
 
     Args:
       height: metres.

@@ -38,7 +38,7 @@ class Instance:
     ended: str = ""  # cleared, pushed out, out of actions, fault
     did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action
     missed: tuple[np.ndarray, ...] = ()  # grasps [3] that missed and around which nothing has moved since
-    film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # what preceded each action
+    film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # poses and decision before each action
 
     @property
     def actions(self) -> int:

@@ -55,7 +55,7 @@ def clear(
       partial: where an interrupted evaluation is kept.
       seed: random seed of the push candidates.
       longest: metres of the longest push that `decide` asks for.
-      remember: tell `decide` of the grasps that missed around which nothing has moved since.
+      remember: give `decide` the grasps that missed and near which nothing has moved since.
 
     Returns:
       The instances, ended.

@@ -1,4 +1,4 @@
-"""Decisions with the engine itself as predictor (`physics+gn`): no predictor can be better."""
+"""Decisions with the engine itself as predictor (`physics+gn`), which no network can be expected to beat."""
 
 from __future__ import annotations
 

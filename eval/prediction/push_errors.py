@@ -82,7 +82,7 @@ def evaluate(
                 films += [executed.film(seen, motions, i) for i in range(min(FILMS - len(films), len(executed)))]
             empty = 0 if len(executed) else empty + 1
             if empty == MAX_ATTEMPTS:
-                raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; loosen the scenes")
+                raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; give fewer --objects")
             progress.advance(len(executed))
             done, batch = done + len(executed), batch + 1
             partial.save((done, batch, rows, films))

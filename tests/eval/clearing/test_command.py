@@ -102,12 +102,12 @@ def test_a_miss_is_remembered_until_something_near_it_moves(settled: Any) -> Non
 
 def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pathlib.Path]) -> None:
     for method, net in (("dipn+gn", "push"), ("vpg", "value"), ("physics+gn", "grasp")):
-        with pytest.raises(UserError, match=f"--method {method.replace('+', '.')}: wants --{net}-net"):
+        with pytest.raises(UserError, match=f"--method {method.replace('+', '.')}: needs --{net}-net"):
             _load(method, Networks(), engine)
     grasps_only = Networks(None, runs["grasp"], runs["only"])
-    with pytest.raises(UserError, match="has not learnt to push"):
+    with pytest.raises(UserError, match="was not trained to push"):
         _load("dqn+gn", grasps_only, engine)
-    with pytest.raises(UserError, match="has learnt values, not chances"):
+    with pytest.raises(UserError, match="predicts values, not chances"):
         _load("rea+dipn", _networks(runs), engine)
     with pytest.raises(UserError, match="holds a grasp network, want vpg"):
         _load("vpg", Networks(value=runs["grasp"]), engine)
