@@ -171,7 +171,7 @@ def grasping_policy(scorer: Scorer) -> Policy:
 
 
 def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSummary | None) -> Act:
-    """Build the policy of Alg. 2: imagine the image after every candidate push."""
+    """Return the function that decides by Alg. 2: it imagines the image after every candidate push."""
 
     def act(key: jax.Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
         count = len(distances)
@@ -183,12 +183,12 @@ def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSumm
 
 
 def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Act:
-    """Build the policy that compares the best push and the best grasp by value; all pushes go the first distance.
+    """Return the function that compares the best push and the best grasp by value; pushes go the first distance.
 
     Args:
       push_scorer: values of pushes.
       scorer: values of grasps.
-      grasp_at_once: whether the rule's `grasp_above` holds.
+      grasp_at_once: whether to grasp at once above the rule's `grasp_above`.
     """
 
     def act(_: jax.Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
@@ -203,7 +203,7 @@ def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Ac
 def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSummary]:
     """Return the scorer that GN's grasps are chosen by, and the summary that images are compared by.
 
-    The clauses of the released code look at the highest score on every image, which only whole images tell.
+    The clauses of the released code need the highest score of every image, so images are then scored whole.
     """
     return scorers.load_scorer(run, cautious=config.cautious), scorers.load_summary(run, whole=config.released)
 

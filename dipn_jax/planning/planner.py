@@ -163,7 +163,7 @@ def decide(
 ) -> Decision:
     """Choose between the best grasp and the best push (Alg. 2 of the paper).
 
-        predictor, scorer = policy.load_predictor("builtin"), policy.load_scorer("builtin")
+        predictor, scorer = predictors.load_predictor("builtin"), scorers.load_scorer("builtin")
         decision = dipn_jax.decide(jax.random.key(0), observation, predictor, scorer)
 
     Args:
