@@ -28,15 +28,15 @@ OBJECTS = 7
 ITEMS = tuple(item.name for item in shapes.CATALOGUE if item.shape != "concave")
 """Items of one convex part each, which PyBullet takes as they are."""
 LADDER = (Settings(1 / 240, 50), Settings(1 / 480, 50), Settings(1 / 480, 100), Settings(1 / 960, 100))
-"""From cheap to exact; a time step of 1/240 s and 50 iterations are PyBullet's own."""
+"""Settings of PyBullet, from cheap to exact; the first are its defaults."""
 SAME_STEP = LADDER[1]
 """Settings with about the time step of our own engine (2 ms)."""
-LIKE = 1.25
-"""Depth of contacts while objects fall (`DEEP` of them), over ours, up to which PyBullet's settings count as like.
+MAX_DEPTH_RATIO = 1.25
+"""Depth of contacts in a fall (`DEPTH_QUANTILE` of them) over ours that PyBullet's settings may have.
 
-At rest Bullet keeps a slop of 0.01 mm at any time step, which says nothing.
+Depth at rest would say nothing: there Bullet keeps a slop of 0.01 mm at any time step.
 """
-DEEP = 0.99
+DEPTH_QUANTILE = 0.99
 """Quantile of the depths of contacts."""
 STANDOFF = 0.09
 """Metres from the middle of an object at which a push comes down."""
@@ -104,7 +104,7 @@ def _corners(scene: Scene, index: int, slot: int) -> np.ndarray:
 
 
 def our_depth(seed: int, count: int) -> float:
-    """Return the `DEEP` quantile of the depth (metres) of all contacts in `count` falls in the native engine."""
+    """Return the `DEPTH_QUANTILE` of the depth (metres) of all contacts in `count` falls in the native engine."""
     scene, poses = _drawn(seed, count)
     depths = []
     for i in range(count):
@@ -116,7 +116,7 @@ def our_depth(seed: int, count: int) -> float:
         for _ in range(round(primitives.SETTLE_TIME / compiled.opt.timestep)):
             mujoco.mj_step(compiled, data)
             depths.append(-data.contact.dist[data.contact.dist < 0])
-    return float(np.quantile(np.concatenate(depths), DEEP))
+    return float(np.quantile(np.concatenate(depths), DEPTH_QUANTILE))
 
 
 def like(pool: Pool, seed: int, count: int, limit: float) -> tuple[Settings, float]:
@@ -125,7 +125,7 @@ def like(pool: Pool, seed: int, count: int, limit: float) -> tuple[Settings, flo
     for settings in LADDER:
         watched = [dataclasses.replace(work, watch=True) for work in works(seed, count, settings)]
         made = pool.map(bullet_worker.episodes, watched, chunksize=1)
-        depth = float(np.quantile(np.concatenate([depths for _, depths in made]), DEEP))
+        depth = float(np.quantile(np.concatenate([depths for _, depths in made]), DEPTH_QUANTILE))
         if depth <= limit:
             break
     return settings, depth
@@ -145,7 +145,7 @@ def vs_pybullet(setting: Setting) -> Iterator[tuple[str, float]]:
     make_data(job)  # compiles
     with multiprocessing.get_context("spawn").Pool(cores()) as pool:
         pool.map(bullet_worker.ready, range(cores()), chunksize=1)
-        settings, theirs_depth = like(pool, setting.seed + 1, 8 * cores(), LIKE * depth)
+        settings, theirs_depth = like(pool, setting.seed + 1, 8 * cores(), MAX_DEPTH_RATIO * depth)
         for name, chosen in (("", settings), ("/same_step", SAME_STEP)):
             work = works(setting.seed, count, chosen)
             theirs = functools.partial(pool.map, bullet_worker.episodes, work, chunksize=1)

@@ -11,7 +11,7 @@ import numpy as np
 
 CONTROL_PERIOD = 0.01
 """Seconds between set points of the gripper, as in the project's own engines."""
-AWAY = (0.0, 0.0, 2.0)
+WAITING_POSITION = (0.0, 0.0, 2.0)
 """Position in metres where the gripper waits while objects fall."""
 GRIPPER_FORCE = 100.0
 """Largest force in newtons that moves the gripper."""
@@ -112,9 +112,9 @@ def _world(bullet: Any, client: int, work: Work, index: int) -> tuple[list[int],
     bullet.changeDynamics(floor, -1, lateralFriction=1.0, **at)  # Bullet multiplies the two coefficients
     bodies = [_object(bullet, client, work, index, slot) for slot in range(work.poses.shape[1])]
     shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=work.gripper, **at)
-    hand = bullet.createMultiBody(work.gripper_mass, shape, basePosition=AWAY, **at)
-    held = bullet.createConstraint(hand, -1, -1, -1, bullet.JOINT_FIXED, [0, 0, 0], [0, 0, 0], AWAY, **at)
-    bullet.changeConstraint(held, AWAY, maxForce=GRIPPER_FORCE, **at)
+    hand = bullet.createMultiBody(work.gripper_mass, shape, basePosition=WAITING_POSITION, **at)
+    held = bullet.createConstraint(hand, -1, -1, -1, bullet.JOINT_FIXED, [0, 0, 0], [0, 0, 0], WAITING_POSITION, **at)
+    bullet.changeConstraint(held, WAITING_POSITION, maxForce=GRIPPER_FORCE, **at)
     return bodies, hand, held
 
 

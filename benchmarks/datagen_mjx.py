@@ -25,7 +25,7 @@ from dipn_jax.world.model import GRIPPER_DOF
 
 OBJECTS = 7
 """Number of objects in a scene."""
-FALL = 0.5
+FALL_SECONDS = 0.5
 """Seconds for which objects have fallen before the measurement begins: the heap still moves."""
 
 
@@ -45,7 +45,7 @@ def heaps(seed: int, batch: int) -> tuple[Scene, np.ndarray]:
     start = np.tile(np.asarray(poses), (batch, 1, 1))
     # objects start between the bounding spheres of one another, so they may be turned at will
     start[..., 3:] = np.asarray(geometry.random_quat(jax.random.fold_in(key, 1), shape=(batch, OBJECTS)))
-    rollout = primitives.settle(make_engine("native"), repeated, start, duration=FALL)
+    rollout = primitives.settle(make_engine("native"), repeated, start, duration=FALL_SECONDS)
     return repeated, np.asarray(rollout.poses)[:, -1]
 
 

@@ -29,7 +29,7 @@ from dipn_jax.world import cases, clutter, scenes
 BUILTIN = pathlib.Path("builtin")
 COUNTS = (16, 64, 256)
 """Numbers of candidates."""
-ALWAYS = planner.Rule(grasp_above=1.0)
+ALWAYS_CONSIDER_PUSHES = planner.Rule(grasp_above=1.0)
 """A rule that considers pushes however good the best grasp is: a decision at its full cost."""
 KINDS = (("3:8", 1.0), ("1:10", 0.0), ("20", 0.0), ("30", 0.0))
 """Numbers of objects, and shares of packed scenes, on which both paths decide."""
@@ -62,7 +62,9 @@ def _decider(preset: str, count: int, *, fast: bool) -> Callable[[Observation, i
     def decide(seen: Observation, key: int) -> Decision:
         random = jax.random.key(key)
         return jax.device_get(
-            planner.decide(random, seen, predictor, scorer, count=count, rule=ALWAYS, summarize=summarize)
+            planner.decide(
+                random, seen, predictor, scorer, count=count, rule=ALWAYS_CONSIDER_PUSHES, summarize=summarize
+            )
         )
 
     return decide

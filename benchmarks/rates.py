@@ -30,7 +30,7 @@ FEW_ON_CPU = 4
 """Episodes of each kind that MJX and Warp make on a CPU at small scale, where their rate is below one per second."""
 BATCHES = (512, 1024, 2048, 4096)
 """Numbers of heaps simulated at once on an accelerator, for `scene_seconds`."""
-SPAN = 0.2
+SIMULATED_SECONDS = 0.2
 """Seconds for which they are simulated."""
 
 
@@ -69,11 +69,11 @@ def scene_seconds(setting: Setting) -> Iterator[tuple[str, float]]:
     for name in names[: 3 if importlib.util.find_spec("warp") else 2]:
         for batch in (64,) if jax.default_backend() == "cpu" else BATCHES:
             scene, poses = heaps(setting.seed, batch)
-            still, end = primitives.parked_trajectory(batch, SPAN), np.array([SPAN])
+            still, end = primitives.parked_trajectory(batch, SIMULATED_SECONDS), np.array([SIMULATED_SECONDS])
             work = functools.partial(_sized(name, batch).simulate, scene, poses, still, end)
             work()  # compiles
             taken = statistics.median(seconds(work) for _ in range(setting.pick(1, 5)))
-            yield f"engines.scene_seconds/{name}/{batch}", batch * SPAN / taken
+            yield f"engines.scene_seconds/{name}/{batch}", batch * SIMULATED_SECONDS / taken
 
 
 def _sized(name: EngineName, batch: int) -> Engine:

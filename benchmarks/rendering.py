@@ -24,7 +24,7 @@ BATCH = 16
 """Number of scenes."""
 CAMERA_HEIGHT = 1.0
 """Height in metres above the table from which rays start."""
-AWAY = 3.0
+GRIPPER_HEIGHT = 3.0
 """Height in metres to which the gripper is lifted out of the view."""
 LABELS_EQUAL = 0.999
 """Smallest share of pixels on which both must agree for their times to be compared."""
@@ -44,7 +44,7 @@ class RayCaster:
         models = [mujoco.MjModel.from_xml_string(text) for text in texts]
         self.sims = mujoco_batch.Batch(models[0], nsim=len(models), nthread=cores())
         self.sims.set_models(models)
-        self.sims.qpos[:, 2] = AWAY
+        self.sims.qpos[:, 2] = GRIPPER_HEIGHT
         self.sims.qpos[:, model.GRIPPER_DOF :] = np.asarray(items.poses).reshape(len(models), -1)
         self.slot = models[0].geom_bodyid - models[0].body("o0").id  # of each geom; negative: no object
         at = (np.arange(WORKSPACE.pixels) - (WORKSPACE.pixels - 1) / 2) * WORKSPACE.pixel

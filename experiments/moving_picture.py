@@ -37,17 +37,17 @@ from dipn_jax.world import primitives
 
 SIZE = (7.4, 4.15)
 """Width and height of the picture in inches."""
-DOTS = 100
+DPI = 100
 """Resolution in pixels per inch."""
 PERIOD = 0.1
 """Simulated seconds between frames."""
-SHOWN = 0.12
+FRAME_SECONDS = 0.12
 """Seconds for which a frame is shown."""
-HOLD = 8
+HOLD_FRAMES = 8
 """Frames for which a decision is shown before it is executed, and the result after a push."""
 THRESHOLD = 0.7
 """Score above which `dipn-eval clear` grasps at once by default."""
-DARK = "#1b1b1b"
+BACKGROUND = "#1b1b1b"
 """Colour of the background."""
 COLORS = 96
 """Number of colours in the GIF's palette."""
@@ -117,12 +117,12 @@ def frames(shown: film.Film, engine: Any) -> Iterator[Frame]:
         note = "" if push else "grasp at once:\nno push is imagined" if score > THRESHOLD else "no push promises more"
         about = (said, note, shown.pictures(step)[1] if push else None)
         action = {"push": shown.push[step]} if push else {"grasp": shown.grasp[step]}
-        yield from [Frame(before, *about, **action)] * (HOLD if push else HOLD // 2)
+        yield from [Frame(before, *about, **action)] * (HOLD_FRAMES if push else HOLD_FRAMES // 2)
         for poses, gripper in zip(*simulated(shown, step, engine), strict=True):
             yield Frame(seen(scene, poses), *about, gripper)
         if push:
-            yield from [Frame(seen(scene, shown.poses[step + 1]), *about)] * HOLD
-    yield from [Frame(seen(scene_at(shown, -1), shown.poses[-1]), "cleared")] * HOLD
+            yield from [Frame(seen(scene, shown.poses[step + 1]), *about)] * HOLD_FRAMES
+    yield from [Frame(seen(scene_at(shown, -1), shown.poses[-1]), "cleared")] * HOLD_FRAMES
 
 
 def fingers(axis: Any, gripper: np.ndarray) -> None:
@@ -139,7 +139,7 @@ def fingers(axis: Any, gripper: np.ndarray) -> None:
 
 def draw(frame: Frame) -> Image.Image:
     """Draw one picture."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=SIZE, dpi=DOTS, facecolor=DARK)
+    figure, (left, right) = plt.subplots(1, 2, figsize=SIZE, dpi=DPI, facecolor=BACKGROUND)
     figure.subplots_adjust(0.015, 0.02, 0.985, 0.87, 0.03)
     drawing.show(left, smooth(frame.picture))
     left.set_title(frame.title, color="white", fontsize=10, loc="left")
@@ -173,7 +173,7 @@ def save(pictures: list[Image.Image], path: pathlib.Path) -> None:
     palette = sheet.quantize(COLORS, dither=Image.Dither.NONE)
     flat = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
     path.parent.mkdir(parents=True, exist_ok=True)
-    flat[0].save(path, save_all=True, append_images=flat[1:], duration=int(1000 * SHOWN), loop=0, optimize=True)
+    flat[0].save(path, save_all=True, append_images=flat[1:], duration=int(1000 * FRAME_SECONDS), loop=0, optimize=True)
 
 
 def main(

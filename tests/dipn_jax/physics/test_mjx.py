@@ -51,7 +51,7 @@ LINES = (
 )
 
 
-DEVICES = """
+FOUR_DEVICES = """
 import jax, numpy as np
 from dipn_jax import console
 from dipn_jax.world import primitives, scenes
@@ -211,7 +211,7 @@ def test_a_fence_pushes_as_in_mujoco_c(
 
 def test_a_batch_is_shared_by_all_devices_with_equal_results(tmp_path: pathlib.Path) -> None:
     script = tmp_path / "devices.py"
-    script.write_text(DEVICES)
+    script.write_text(FOUR_DEVICES)
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, script], env=os.environ | flags, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
