@@ -78,10 +78,11 @@ BENCHMARKS = {
     "rates.mjx": Benchmark("episodes a second of MJX, 1 to 30 objects", "none", "rates:mjx"),
     "rates.warp": Benchmark("episodes a second of MuJoCo Warp, 1 to 30 objects", "none", "rates:warp"),
 }
+"""All benchmarks, in the order in which they run."""
 
 
 def chosen(names: Sequence[str]) -> list[str]:
-    """The benchmarks that `names` stand for.
+    """Return the benchmarks that `names` stand for.
 
     Raises:
       UserError: one of them is none.
@@ -93,7 +94,7 @@ def chosen(names: Sequence[str]) -> list[str]:
 
 
 def measure(names: Sequence[str], setting: Setting, out: pathlib.Path | None) -> Figures:
-    """Run `chosen(names)`; figures are printed, and written to `out`, as they come.
+    """Run `chosen(names)`; print each figure and write it to `out` as soon as it is measured.
 
     Raises:
       UserError: a benchmark that was asked for by name cannot run here.
@@ -115,7 +116,7 @@ def measure(names: Sequence[str], setting: Setting, out: pathlib.Path | None) ->
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks, or all; none: list them")
     parser.add_argument("--out", type=pathlib.Path, metavar="FILE.json", help="write figures and machine as JSON")

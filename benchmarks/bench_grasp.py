@@ -1,4 +1,4 @@
-"""GN: training and scoring against PyTorch."""
+"""GN: the speed of training and scoring against PyTorch."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from dipn_jax.sight import render
 from dipn_jax.world import clutter, scenes
 
 BATCHES = {"compact": (32, 112), "paper": (2, VIEW_PIXELS)}
-"""Examples a training step, and pixels a side of each."""
+"""Examples per training step, and pixels a side of each."""
 OBJECTS = 10
+"""Number of objects in a scene."""
 
 
 def _need_torch() -> None:
@@ -29,19 +30,19 @@ def _need_torch() -> None:
 
 
 def _image(seed: int) -> np.ndarray:
-    """What the camera sees of a scene of ten objects `[224, 224, 4]`."""
+    """Return what the camera sees of a scene of ten objects `[224, 224, 4]`."""
     items = clutter.settled_scenes(jax.random.key(seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
     seen = jax.tree.map(lambda leaf: leaf[0], render.observe(items.scene, items.poses))
     return np.asarray(render.rgbd(seen))
 
 
 def compact_vs_torch_paper(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of the 16 rotations of one image: `compact` over the published network in PyTorch."""
+    """Measure seconds of the 16 rotations of one image: `compact` over the published network in PyTorch."""
     yield from _scoring(setting, "compact", 10)
 
 
 def paper_vs_torch_paper(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of the 16 rotations of one image: the published network over the same in PyTorch."""
+    """Measure seconds of the 16 rotations of one image: the published network over the same in PyTorch."""
     yield from _scoring(setting, "paper", 1)
 
 
@@ -64,7 +65,7 @@ def _scoring(setting: Setting, preset: str, count: int) -> Iterator[tuple[str, f
 
 
 def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Samples a second of a training step over those of the same layers in PyTorch, and our peak memory over its."""
+    """Measure samples per second of a training step over those in PyTorch, and our peak memory over PyTorch's."""
     _need_torch()
     image = _image(setting.seed)
     for preset, (batch, side) in BATCHES.items():

@@ -1,4 +1,4 @@
-"""Drop and push on MuJoCo C, as the project does it, against the same in PyBullet with one process a core."""
+"""Drop and push on MuJoCo C, as the project does it, against PyBullet with one process per core."""
 
 from __future__ import annotations
 
@@ -24,35 +24,37 @@ from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import model, primitives, scenes, shapes
 
 OBJECTS = 7
+"""Number of objects in a scene."""
 ITEMS = tuple(item.name for item in shapes.CATALOGUE if item.shape != "concave")
-"""One convex part each, which PyBullet takes as they are."""
+"""Items of one convex part each, which PyBullet takes as they are."""
 LADDER = (Settings(1 / 240, 50), Settings(1 / 480, 50), Settings(1 / 480, 100), Settings(1 / 960, 100))
-"""From cheap to exact; a time step of 1/240 s and 50 iterations are PyBullet's own."""
+"""Settings of PyBullet, from cheap to exact; the first are its defaults."""
 SAME_STEP = LADDER[1]
-"""About the time step of our own engine (2 ms)."""
-LIKE = 1.25
-"""Depth of contacts while objects fall (`DEEP` of them), over ours, up to which PyBullet's settings count as like.
+"""Settings with about the time step of our own engine (2 ms)."""
+MAX_DEPTH_RATIO = 1.25
+"""Depth of contacts in a fall (`DEPTH_QUANTILE` of them) over ours that PyBullet's settings may have.
 
-At rest Bullet keeps a slop of 0.01 mm at any time step, which says nothing.
+Depth at rest would say nothing: there Bullet keeps a slop of 0.01 mm at any time step.
 """
-DEEP = 0.99
+DEPTH_QUANTILE = 0.99
+"""Quantile of the depths of contacts."""
 STANDOFF = 0.09
 """Metres from the middle of an object at which a push comes down."""
 
 
 def config() -> scenes.SceneConfig:
-    """Scenes of both sides."""
+    """Return the scenes that both sides simulate."""
     return scenes.fixed_count(OBJECTS, ranges=scenes.Ranges(items=ITEMS))
 
 
 def _drawn(seed: int, count: int) -> tuple[Scene, np.ndarray]:
-    """Scenes `[count]` in mid-air, as numpy."""
+    """Return scenes `[count]` in mid-air, as NumPy arrays."""
     draw = jax.jit(jax.vmap(lambda key: scenes.random_scene(key, config=config())))
     return jax.tree.map(np.asarray, draw(jax.random.split(jax.random.key(seed), count)))
 
 
 def _paths(rng: np.random.Generator, count: int) -> np.ndarray:
-    """The gripper's middle and yaw `[count, T, 4]`, one a control period, through the middle of the pushed object."""
+    """Return the gripper's middle and yaw `[count, T, 4]` every control period, through the middle of an object."""
     angle = rng.uniform(-np.pi, np.pi, count).astype(np.float32)
     toward = np.stack([np.cos(angle), np.sin(angle)], -1)
     trajectory = primitives.push_trajectory(
@@ -66,7 +68,7 @@ def _paths(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def works(seed: int, count: int, settings: Settings) -> list[Work]:
-    """`count` episodes, shared out to all cores in pieces."""
+    """Divide `count` episodes among all cores."""
     scene, poses = _drawn(seed, count)
     rng = np.random.default_rng(seed)
     paths, aimed = _paths(rng, count), rng.integers(OBJECTS, size=count)
@@ -97,12 +99,12 @@ def works(seed: int, count: int, settings: Settings) -> list[Work]:
 
 
 def _corners(scene: Scene, index: int, slot: int) -> np.ndarray:
-    """Distinct corners `[K, 3]` of a convex object."""
+    """Return the distinct corners `[K, 3]` of a convex object."""
     return np.unique(shapes.UNIT_VERTICES[scene.shape[index, slot], 0], axis=0) * scene.size[index, slot]
 
 
 def our_depth(seed: int, count: int) -> float:
-    """`DEEP` quantile of the depth (metres) of all contacts after all steps of `count` falls in the native engine."""
+    """Return the `DEPTH_QUANTILE` of the depth (metres) of all contacts in `count` falls in the native engine."""
     scene, poses = _drawn(seed, count)
     depths = []
     for i in range(count):
@@ -114,23 +116,23 @@ def our_depth(seed: int, count: int) -> float:
         for _ in range(round(primitives.SETTLE_TIME / compiled.opt.timestep)):
             mujoco.mj_step(compiled, data)
             depths.append(-data.contact.dist[data.contact.dist < 0])
-    return float(np.quantile(np.concatenate(depths), DEEP))
+    return float(np.quantile(np.concatenate(depths), DEPTH_QUANTILE))
 
 
 def like(pool: Pool, seed: int, count: int, limit: float) -> tuple[Settings, float]:
-    """The cheapest settings of the ladder that sink no deeper than `limit` metres (else the last), and how deep."""
+    """Return the cheapest settings of the ladder that sink at most `limit` metres (else the last), and how deep."""
     depth = np.inf
     for settings in LADDER:
         watched = [dataclasses.replace(work, watch=True) for work in works(seed, count, settings)]
         made = pool.map(bullet_worker.episodes, watched, chunksize=1)
-        depth = float(np.quantile(np.concatenate([depths for _, depths in made]), DEEP))
+        depth = float(np.quantile(np.concatenate([depths for _, depths in made]), DEPTH_QUANTILE))
         if depth <= limit:
             break
     return settings, depth
 
 
 def vs_pybullet(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Episodes a second over PyBullet's, and how deep objects sink in either.
+    """Measure episodes per second over PyBullet's, and how deep objects sink in each.
 
     One push on each dropped scene on both sides. PyBullet is spared what costs us: it looks for no push, throws no
     episode away and writes none to disk.
@@ -151,7 +153,7 @@ def vs_pybullet(setting: Setting) -> Iterator[tuple[str, float]]:
     make_data(job)  # compiles
     with multiprocessing.get_context("spawn").Pool(cores()) as pool:
         pool.map(bullet_worker.ready, range(cores()), chunksize=1)
-        settings, theirs_depth = like(pool, setting.seed + 1, 8 * cores(), LIKE * depth)
+        settings, theirs_depth = like(pool, setting.seed + 1, 8 * cores(), MAX_DEPTH_RATIO * depth)
         for name, chosen in (("", settings), ("/same_step", SAME_STEP)):
             work = works(setting.seed, count, chosen)
             theirs = functools.partial(pool.map, bullet_worker.episodes, work, chunksize=1)

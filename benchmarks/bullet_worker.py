@@ -1,4 +1,4 @@
-"""The same drop and push in PyBullet, in one process: no JAX here, every core runs one of these."""
+"""The same drop and push in PyBullet, in one process; it imports no JAX, and every core runs one."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 
 CONTROL_PERIOD = 0.01
 """Seconds between set points of the gripper, as in the project's own engines."""
-AWAY = (0.0, 0.0, 2.0)
-"""Metres: where the gripper waits while objects fall."""
+WAITING_POSITION = (0.0, 0.0, 2.0)
+"""Position in metres where the gripper waits while objects fall."""
 GRIPPER_FORCE = 100.0
-"""Newtons that move the gripper at most."""
+"""Largest force in newtons that moves the gripper."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What accuracy costs in PyBullet."""
+    """The settings of PyBullet that decide how accurate it is."""
 
     timestep: float  # seconds
     iterations: int
@@ -27,7 +27,7 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """Scenes for one process, plain arrays; E scenes of N objects."""
+    """The scenes for one process as plain arrays; E scenes of N objects."""
 
     settings: Settings
     vertices: list[list[np.ndarray]]  # [E][N] corners [K, 3] metres, object's frame
@@ -46,7 +46,7 @@ class Work:
 
 
 def ready(_: int) -> bool:
-    """Import what `episodes` needs, so that no clock sees it."""
+    """Import what `episodes` needs, so that the import is not timed."""
     import pybullet
 
     return bool(pybullet.isNumpyEnabled())
@@ -84,7 +84,7 @@ def episodes(work: Work) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _placed(bullet: Any, target: np.ndarray) -> tuple[list[float], tuple[float, ...]]:
-    """Position and quaternion of the gripper at `target [4]`."""
+    """Return position and quaternion of the gripper at `target [4]`."""
     return list(target[:3]), bullet.getQuaternionFromEuler([0.0, 0.0, float(target[3])])
 
 
@@ -93,7 +93,7 @@ def _nothing(bullet: Any, client: int) -> np.ndarray:
 
 
 def _steps(bullet: Any, client: int, count: int, look: Callable[..., np.ndarray] = _nothing) -> list[np.ndarray]:
-    """Step `count` times; what `look` sees after each step."""
+    """Step `count` times and return what `look` returns after each step."""
     seen = []
     for _ in range(count):
         bullet.stepSimulation(physicsClientId=client)
@@ -102,7 +102,7 @@ def _steps(bullet: Any, client: int, count: int, look: Callable[..., np.ndarray]
 
 
 def _world(bullet: Any, client: int, work: Work, index: int) -> tuple[list[int], int, int]:
-    """Table, objects and gripper of one scene: the objects, the gripper, and the constraint that holds it."""
+    """Build the table, objects and gripper of one scene; return the objects, the gripper and its constraint."""
     at = {"physicsClientId": client}
     bullet.resetSimulation(**at)
     bullet.setGravity(0, 0, -9.81, **at)
@@ -112,9 +112,9 @@ def _world(bullet: Any, client: int, work: Work, index: int) -> tuple[list[int],
     bullet.changeDynamics(floor, -1, lateralFriction=1.0, **at)  # Bullet multiplies the two coefficients
     bodies = [_object(bullet, client, work, index, slot) for slot in range(work.poses.shape[1])]
     shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=work.gripper, **at)
-    hand = bullet.createMultiBody(work.gripper_mass, shape, basePosition=AWAY, **at)
-    held = bullet.createConstraint(hand, -1, -1, -1, bullet.JOINT_FIXED, [0, 0, 0], [0, 0, 0], AWAY, **at)
-    bullet.changeConstraint(held, AWAY, maxForce=GRIPPER_FORCE, **at)
+    hand = bullet.createMultiBody(work.gripper_mass, shape, basePosition=WAITING_POSITION, **at)
+    held = bullet.createConstraint(hand, -1, -1, -1, bullet.JOINT_FIXED, [0, 0, 0], [0, 0, 0], WAITING_POSITION, **at)
+    bullet.changeConstraint(held, WAITING_POSITION, maxForce=GRIPPER_FORCE, **at)
     return bodies, hand, held
 
 
@@ -136,7 +136,7 @@ def _object(bullet: Any, client: int, work: Work, index: int, slot: int) -> int:
 
 
 def _depths(bullet: Any, client: int, bodies: list[int]) -> np.ndarray:
-    """Metres by which the objects are in what they touch, one for each contact that is under load."""
+    """Return by how many metres the objects are in what they touch, one for each contact under load."""
     points = {}
     for body in bodies:
         for point in bullet.getContactPoints(body, physicsClientId=client):

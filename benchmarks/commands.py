@@ -19,7 +19,7 @@ def _python(*arguments: str) -> None:
 
 
 def help_vs_jax(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of a command's `--help` over seconds of `import jax`: the slowest of several; and those of each."""
+    """Measure seconds of a command's `--help` over seconds of `import jax`: of the slowest command, and of each."""
     repeats = setting.pick(5, 15)
     ratios: dict[str, float] = {}
     slowest = 0.0

@@ -1,4 +1,4 @@
-"""First calls in a fresh process, with and without what the last process compiled."""
+"""Seconds of first calls in a fresh process, with and without the programs that the last process compiled."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from benchmarks.harness import Setting
 from dipn_jax import batching
 from dipn_jax.sight import render
 
-OBJECTS, BATCH = 7, 4
+OBJECTS = 7
+"""Number of objects in a scene."""
+BATCH = 4
+"""Number of scenes."""
 
 
 def first_calls() -> float:
-    """Seconds of the first call of everything that is compiled on the way to a push episode with MJX."""
+    """Measure the seconds of the first call of everything that is compiled on the way to a push episode with MJX."""
     import jax
     import numpy as np
 
@@ -42,7 +45,7 @@ def first_calls() -> float:
 
 
 def _fresh(cache: pathlib.Path) -> float:
-    """`first_calls` in a process of its own that keeps compiled programs in `cache`."""
+    """Run `first_calls` in its own process that keeps compiled programs in `cache`."""
     root = str(pathlib.Path(__file__).parent.parent)
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "PYTHONPATH": path}
@@ -52,7 +55,7 @@ def _fresh(cache: pathlib.Path) -> float:
 
 
 def warm_over_cold(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds with a warm cache over seconds with an empty one."""
+    """Measure seconds with a warm cache over seconds with an empty one."""
     cold = warm = 0.0
     for _ in range(setting.pick(1, 3)):
         with tempfile.TemporaryDirectory() as name:

@@ -24,32 +24,33 @@ from dipn_jax.world import model, primitives, scenes
 from dipn_jax.world.model import GRIPPER_DOF
 
 OBJECTS = 7
-FALL = 0.5
-"""Seconds for which objects have fallen when the clock starts: a heap that still moves."""
+"""Number of objects in a scene."""
+FALL_SECONDS = 0.5
+"""Seconds for which objects have fallen before the measurement begins: the heap still moves."""
 
 
 @functools.cache
 def engine() -> MjxEngine:
-    """One for all benchmarks: it keeps its compiled programs."""
+    """Return one engine for all benchmarks: it keeps its compiled programs."""
     made = make_engine("mjx")
     assert isinstance(made, MjxEngine)
     return made
 
 
 def heaps(seed: int, batch: int) -> tuple[Scene, np.ndarray]:
-    """One random scene `batch` times, and poses `[batch, N, 7]` of a different heap of it in each."""
+    """Return one random scene `batch` times, and poses `[batch, N, 7]` of a different heap of it in each."""
     key = jax.random.key(seed)
     scene, poses = scenes.random_scene(key, config=scenes.fixed_count(OBJECTS))
     repeated = structs.take(jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene), np.zeros(batch, int))
     start = np.tile(np.asarray(poses), (batch, 1, 1))
     # objects start between the bounding spheres of one another, so they may be turned at will
     start[..., 3:] = np.asarray(geometry.random_quat(jax.random.fold_in(key, 1), shape=(batch, OBJECTS)))
-    rollout = primitives.settle(make_engine("native"), repeated, start, duration=FALL)
+    rollout = primitives.settle(make_engine("native"), repeated, start, duration=FALL_SECONDS)
     return repeated, np.asarray(rollout.poses)[:, -1]
 
 
 def plain_mjcf(scene: Scene, config: PhysicsConfig) -> str:
-    """The world of one scene without the geoms that only keep layouts alike."""
+    """Return the world of one scene without the geoms that only keep memory layouts equal."""
     root = ElementTree.fromstring(model.mjcf(scene, config=config))
     gone = {geom.get("name") for geom in root.iter("geom") if geom.get("contype") == "8"}
     for parent in list(root.iter()):
@@ -62,7 +63,7 @@ def plain_mjcf(scene: Scene, config: PhysicsConfig) -> str:
 
 
 class Naive:
-    """`jax.vmap(mjx.step)`, jitted, in a Python loop; contacts as they come."""
+    """The loop to compare with: `jax.vmap(mjx.step)`, jitted, called in Python, with no limit on contacts."""
 
     def __init__(self, scene: Scene, poses: np.ndarray, config: PhysicsConfig) -> None:
         """Compile for the scene `scene [B]` (the same in every row) from `poses [B, N, 7]`."""
@@ -82,7 +83,7 @@ class Naive:
 
     @staticmethod
     def _step(m: Any, data: Any) -> Any:
-        """One step of all scenes; weak types, of which MJX returns some, would make the second call compile again."""
+        """Step all scenes once; weak types, some of which MJX returns, would make the second call compile again."""
         new = jax.vmap(mjx.step, in_axes=(None, 0))(m, data)
         return jax.tree.map(lambda leaf, old: jnp.asarray(leaf).astype(old.dtype), new, data)
 
@@ -96,13 +97,13 @@ class Naive:
 
 
 def ours(scene: Scene, poses: np.ndarray, duration: float) -> Callable[[], Any]:
-    """Work: the engine's own program for `duration` seconds."""
+    """Return work for the clock: the engine's own program for `duration` seconds."""
     still, end = primitives.parked_trajectory(len(poses), duration), np.array([duration])
     return lambda: engine().simulate(scene, poses, still, end)
 
 
 def vs_naive(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of the loop over seconds of the engine, as many steps of the same scenes."""
+    """Measure seconds of the loop over seconds of the engine, for the same steps of the same scenes."""
     duration = setting.pick(10, 30) / 100
     config = engine().config
     steps = round(duration / 0.01) * substeps(config)
@@ -119,7 +120,7 @@ def vs_naive(setting: Setting) -> Iterator[tuple[str, float]]:
 
 
 def batch_scaling(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Cost of a step of one scene in a batch of 128 over that in one of 16."""
+    """Measure the cost of a step of one scene in a batch of 128 over that in one of 16."""
     duration = setting.pick(10, 30) / 100
     few, many = (ours(*heaps(setting.seed, batch), duration) for batch in (16, 128))
     few(), many()  # compile

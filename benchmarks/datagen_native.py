@@ -1,4 +1,4 @@
-"""Data generation on MuJoCo C against the bare steps inside it, bit for bit the same ones."""
+"""Data generation on MuJoCo C against the bare steps inside it, which are the same bit for bit."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from benchmarks.harness import Setting, alternate, make_data
 from dipn_jax.world import scenes
 
 ACTIONS = {"push": 3, "grasp": 6}
-"""Actions tried on one scene: what the commands do unasked."""
+"""Actions tried on one scene, the defaults of the commands."""
 SHARDS = 4
+"""Number of shards of the data set."""
 INPUTS = ("ctrl", "qfrc_applied")
 """What the engine sets between steps."""
 
 
 @dataclasses.dataclass
 class Tape:
-    """One batch of simulations: how it began, what was set before each call of `step`, how it ended."""
+    """One recorded batch of simulations: how it began, what was set before each call of `step`, how it ended."""
 
     nthread: int
     models: list[Any] = dataclasses.field(default_factory=list)
@@ -35,7 +36,7 @@ class Tape:
 
 @contextlib.contextmanager
 def recording() -> Iterator[list[Tape]]:
-    """Within it, the native engine keeps a tape of every batch it simulates."""
+    """Make the native engine record a tape of every batch that it simulates in this context."""
     tapes: list[Tape] = []
 
     class Recorder(mujoco_batch.Batch):
@@ -63,7 +64,7 @@ def recording() -> Iterator[list[Tape]]:
 
 
 class Replay:
-    """A tape made ready to be stepped again, with nothing else in between."""
+    """A tape ready to be stepped again, with nothing else between the steps."""
 
     def __init__(self, tape: Tape) -> None:
         self.tape = tape
@@ -73,7 +74,7 @@ class Replay:
         self.inputs = {name: getattr(self.sims, name) for name in INPUTS}
 
     def run(self) -> None:
-        """The bare steps."""
+        """Step without anything else."""
         for values, options in self.tape.calls:
             for name, value in values.items():
                 self.inputs[name][:] = value
@@ -81,7 +82,7 @@ class Replay:
                 self.sims.step(**options)
 
     def check(self) -> None:
-        """That the same states were passed.
+        """Check that the replay passed through the same states.
 
         Raises:
           RuntimeError: they were not, so the two times do not belong together.
@@ -91,7 +92,7 @@ class Replay:
 
 
 def share(setting: Setting, kind: str, objects: int) -> float:
-    """Seconds of the bare steps over seconds of the data set that they were recorded in."""
+    """Measure seconds of the bare steps over seconds of the data set that they were recorded in."""
     size = setting.pick(96, 480)
     job = Job(
         kind=kind,
@@ -124,11 +125,11 @@ def share(setting: Setting, kind: str, objects: int) -> float:
 
 
 def share_of_bare(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Pushes on disk a second over what the engine's steps alone would allow."""
+    """Measure pushes on disk per second over what the engine's steps alone would allow."""
     for objects in (7, 10):
         yield f"datagen_native.share_of_bare/{objects}", share(setting, "push", objects)
 
 
 def grasp_share_of_bare(setting: Setting) -> Iterator[tuple[str, float]]:
-    """The same for grasps."""
+    """Measure grasps on disk per second over what the engine's steps alone would allow."""
     yield "datagen_native.grasp_share_of_bare/10", share(setting, "grasp", 10)

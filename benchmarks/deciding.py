@@ -1,4 +1,4 @@
-"""Seconds per decision, whether the fast path decides as the plain one, and what lockstep gains."""
+"""Seconds per decision, whether the fast path decides as the plain one does, and what lockstep gains."""
 
 from __future__ import annotations
 
@@ -28,14 +28,15 @@ from dipn_jax.world import cases, clutter, scenes
 
 BUILTIN = pathlib.Path("builtin")
 COUNTS = (16, 64, 256)
-ALWAYS = planner.Rule(grasp_above=1.0)
-"""Pushes are considered however good the best grasp is: a decision at its full cost."""
+"""Numbers of candidates."""
+ALWAYS_CONSIDER_PUSHES = planner.Rule(grasp_above=1.0)
+"""A rule that considers pushes however good the best grasp is: a decision at its full cost."""
 KINDS = (("3:8", 1.0), ("1:10", 0.0), ("20", 0.0), ("30", 0.0))
-"""Objects and share of packed scenes of those on which both paths decide."""
+"""Numbers of objects, and shares of packed scenes, on which both paths decide."""
 
 
 def _networks(preset: str) -> tuple[Any, Any]:
-    """DIPN and GN: the trained compact ones, or published ones that know nothing; as fast as if they did."""
+    """Return DIPN and GN: the trained compact networks, or published ones with random weights, which are as fast."""
     if preset == "compact":
         return checkpoint.load_network(BUILTIN, network="dipn"), checkpoint.load_network(BUILTIN, network="grasp")
     dipn = checkpoint.build("dipn", DipnConfig(preset="paper"))
@@ -46,7 +47,7 @@ def _networks(preset: str) -> tuple[Any, Any]:
 
 
 def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> Observation:
-    """Observations `[count]` of random scenes."""
+    """Return observations `[count]` of random scenes."""
     config = scenes.parse_objects(objects, ranges=scenes.Ranges(packed=packed))
     items = clutter.settled_scenes(jax.random.key(seed), make_engine("native"), config, count)
     observations: Observation = jax.device_get(render.observe(items.scene, items.poses))
@@ -61,14 +62,16 @@ def _decider(preset: str, count: int, *, fast: bool) -> Callable[[Observation, i
     def decide(seen: Observation, key: int) -> Decision:
         random = jax.random.key(key)
         return jax.device_get(
-            planner.decide(random, seen, predictor, scorer, count=count, rule=ALWAYS, summarize=summarize)
+            planner.decide(
+                random, seen, predictor, scorer, count=count, rule=ALWAYS_CONSIDER_PUSHES, summarize=summarize
+            )
         )
 
     return decide
 
 
 def speed(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds a decision on a scene of ten objects, all of whose candidates are considered."""
+    """Measure seconds of a decision on a scene of ten objects, all of whose candidates are considered."""
     seen = _seen("10", 4, setting.seed)
     tables = [structs.take(seen, i) for i in range(4)]
     for count in COUNTS:
@@ -94,7 +97,7 @@ def _all(decide: Callable[[Observation, int], Decision], tables: list[Observatio
 
 
 def _imagined(seen: Observation, count: int, predictor: Any) -> Callable[[int], jax.Array]:
-    """The image after candidate `i`, each predicted by itself."""
+    """Return the image after candidate `i`, each predicted by itself."""
     seen = jax.tree.map(jnp.asarray, seen)
     pushes, _ = candidates.sample_pushes(jax.random.key(0), seen, count=count, distance=0.1)
 
@@ -108,7 +111,7 @@ def _imagined(seen: Observation, count: int, predictor: Any) -> Callable[[int], 
 
 
 def _paper_one_by_one(seen: Observation, count: int) -> float:
-    """Seconds an image of the published networks, one candidate and one rotation at a time."""
+    """Measure seconds per image of the published networks, one candidate and one rotation at a time."""
     dipn, gn = _networks("paper")
     image_after = _imagined(seen, count, predictors.dipn_predictor(dipn))
     graph, state = nnx.split(gn)
@@ -130,7 +133,7 @@ def _paper_one_by_one(seen: Observation, count: int) -> float:
 
 
 def _paper_whole(seen: Observation, count: int) -> float:
-    """Seconds an image of the published networks, all rotations of it in one call."""
+    """Measure seconds per image of the published networks, all rotations of it in one call."""
     dipn, gn = _networks("paper")
     image_after = _imagined(seen, count, predictors.dipn_predictor(dipn))
     mean = jax.jit(lambda image: scorers.plain_scorer(gn)(image[None]).mean())
@@ -144,7 +147,7 @@ def _paper_whole(seen: Observation, count: int) -> float:
 
 
 def fast_path(setting: Setting) -> Iterator[tuple[str, float]]:
-    """How often the fast path decides as the plain one, and how many times faster it is, with 64 candidates."""
+    """Measure how often the fast path decides as the plain one does, and how much faster it is, with 64 candidates."""
     each, same, pushed = setting.pick(10, 125), [], []
     for objects, packed in KINDS:
         seen = _seen(objects, each, setting.seed, packed=packed)
@@ -164,12 +167,12 @@ def fast_path(setting: Setting) -> Iterator[tuple[str, float]]:
 
 
 def _same(plain: Decision, fast: Decision) -> bool:
-    """Whether both do the same: a grasp, which is then the same one, or the same push."""
+    """Return whether two decisions are the same: the same grasp, or the same push."""
     return bool(plain.is_push == fast.is_push and (not plain.is_push or plain.best == fast.best))
 
 
 def in_lockstep(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Episodes of the hard instances a minute, side by side, over one after the other."""
+    """Measure episodes of the hard cases per minute, all side by side, over one after the other."""
     engine, path = make_engine("native"), cases.hard_cases_path()
     slots, repeats = int(cases.load_cases(path)[1].shape.shape[1]), setting.pick(1, 3)
     networks = methods.Networks(BUILTIN, BUILTIN)

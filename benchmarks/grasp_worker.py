@@ -1,4 +1,4 @@
-"""Trains GN, or scores an image with it, in one framework: a process of its own.
+"""Train GN, or score an image with it, in one framework, in a process of its own.
 
 `python -m benchmarks.grasp_worker FRAMEWORK PRESET train|score FILE.npz`: `images [B, W, W, 4]` and `pixel [B, 2]` and
 `success [B]`, or `image [224, 224, 4]`, are in the file. See `benchmarks.worker` for what it reads and answers.
@@ -17,7 +17,7 @@ from dipn_jax.networks.grasp import GraspConfig
 
 
 def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
-    """One step of SGD with momentum, or all scores of an image, in JAX; and the number of parameters."""
+    """Return one step of SGD with momentum, or all scores of an image, in JAX; and the number of parameters."""
     import jax
     import jax.numpy as jnp
     from flax import nnx
@@ -42,7 +42,7 @@ def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Ste
 
 
 def torch_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
-    """The same in PyTorch."""
+    """Return the same step in PyTorch."""
     import torch
 
     from benchmarks import torch_grasp
@@ -75,7 +75,7 @@ def torch_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[S
 
 
 def main() -> None:
-    """Entry point of a worker."""
+    """Run a worker."""
     framework, preset, work, file = sys.argv[1:]
     with np.load(file) as stored:
         arrays = dict(stored)

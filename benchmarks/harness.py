@@ -1,4 +1,4 @@
-"""What all benchmarks share: scales, alternating clocks, quiet data sets, facts about the machine."""
+"""What all benchmarks use: scales, alternating measurements, silent data sets, facts about the machine."""
 
 from __future__ import annotations
 
@@ -24,45 +24,45 @@ Scale = Literal["small", "full"]
 
 
 class Skipped(Exception):
-    """A benchmark cannot run here; the message is one line that says what is missing."""
+    """Raised where a benchmark cannot run; the message is one line that says what is missing."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What a run of benchmarks is a function of."""
+    """The settings of a run of benchmarks."""
 
     scale: Scale
     seed: int
 
     def pick(self, small: int, full: int) -> int:
-        """The amount for this scale."""
+        """Return the amount for this scale."""
         return small if self.scale == "small" else full
 
 
 @dataclasses.dataclass(frozen=True)
 class Benchmark:
-    """One name of the command line."""
+    """A benchmark as the command line names it."""
 
     what: str
     goal: str
     place: str  # module:function
 
     def load(self) -> Callable[[Setting], Iterator[tuple[str, float]]]:
-        """The function; what packages say while they are imported is kept off the terminal."""
+        """Import the benchmark's function, hiding what packages print while they are imported."""
         module, _, function = self.place.partition(":")
         with quiet():
             return getattr(importlib.import_module(f"benchmarks.{module}"), function)
 
 
 def seconds(work: Callable[[], Any]) -> float:
-    """Wall-clock seconds that `work` takes."""
+    """Return the wall-clock seconds that `work` takes."""
     begun = time.perf_counter()
     work()
     return time.perf_counter() - begun
 
 
 def alternate(first: Callable[[], Any], second: Callable[[], Any], *, repeats: int) -> tuple[float, float]:
-    """Median seconds of two pieces of work, run in turns so that both meet the same state of the machine.
+    """Return the median seconds of two pieces of work, run in turns so that both meet the same state of the machine.
 
     Args:
       first: some work.
@@ -78,13 +78,13 @@ def alternate(first: Callable[[], Any], second: Callable[[], Any], *, repeats: i
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep what the commands say about their progress off the terminal."""
+    """Hide what the commands print about their progress."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         yield
 
 
 def make_data(job: generate.Job) -> int:
-    """Write the data set of `job` in a temporary folder; returns the bytes of its files."""
+    """Write the data set of `job` in a temporary folder and return the bytes of its files."""
     with tempfile.TemporaryDirectory() as name, quiet():
         folder = pathlib.Path(name) / "data"
         generate.generate(job, folder)
@@ -92,7 +92,7 @@ def make_data(job: generate.Job) -> int:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, accelerator, versions and commit: what figures are to be read with."""
+    """Return processor, accelerator, versions and commit, which figures must be read with."""
     import jax
 
     return {

@@ -29,13 +29,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "half_the_contacts": {"contact_points": (40, 4)},
     "twice_the_contacts": {"contact_points": (160, 16)},
 }
-"""What is otherwise than in `mjx.DEFAULTS`: solver, contact cap, broad phase."""
+"""Settings that differ from `mjx.DEFAULTS`: solver, contact cap, broad phase."""
 SHOWN = {"p50_mm": "5cm/p50_mm", "p90_mm": "5cm/p90_mm", "grasps_equal": "grasp"}
-"""Figures of `world.agreement`; one that is not finite is left out, and `faults` then says why."""
+"""Figures of `world.agreement` that are shown; one that is not finite is left out, and `faults` then says why."""
 
 
 def settings(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds over those of the engine as it is, and `world.agreement` with MuJoCo C, of each variant.
+    """Measure seconds over those of the engine's own settings, and the agreement with MuJoCo C, for each variant.
 
     The scenes are those of `dipn-datagen check-world`: 1 to 7 objects, a push and a grasp in each.
     """
@@ -56,5 +56,5 @@ def settings(setting: Setting) -> Iterator[tuple[str, float]]:
 
 
 def _push(engine: Engine, made: world.Trial) -> Any:
-    """Faults `[B]` of the trial's pushes."""
+    """Return faults `[B]` of the trial's pushes."""
     return primitives.push(engine, made.items.scene, made.items.poses, made.pushes).fault

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.page FILE.json ...`: the figures of several runs as the tables of docs/benchmarks.md."""
+"""`python -m benchmarks.page FILE.json ...` writes the figures of several runs as the tables of docs/benchmarks.md."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from benchmarks.harness import Figures
 from dipn_jax import console, files
 
 SETTINGS = "datagen_mjx.settings"
+"""The benchmark of other settings of MJX."""
 COLUMNS = ("time", "p50_mm", "p90_mm", "grasps_equal", "faults")
-"""Of its table."""
+"""Columns of its table."""
 
 
 def _row(cells: Sequence[str]) -> str:
@@ -20,7 +21,7 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def tables(figures: Figures) -> str:
-    """Ratios with their goals, then episodes a second, then what other settings of MJX cost, as Markdown."""
+    """Return as Markdown ratios with their goals, episodes per second, and the cost of other settings of MJX."""
     ratios = [_row(["figure", "goal", "value"]), _row(["---"] * 3)]
     rates: dict[str, dict[int, float]] = {}
     variants: dict[str, dict[str, float]] = {}
@@ -46,7 +47,7 @@ def tables(figures: Figures) -> str:
 
 
 def merged(paths: Sequence[pathlib.Path]) -> Figures:
-    """Figures of several files of `--out`; of one measured twice, the later file's."""
+    """Return the figures of several files of `--out`; of one measured twice, the later file's."""
     figures: Figures = {}
     for path in paths:
         figures.update(files.read_json(path)["figures"])

@@ -1,4 +1,4 @@
-"""DIPN: training against PyTorch, what its inputs cost, candidates in one call against one call each."""
+"""DIPN: training against PyTorch, the cost of its inputs, candidates in one call against one call each."""
 
 from __future__ import annotations
 
@@ -28,14 +28,17 @@ from dipn_jax.storage import checkpoint
 from dipn_jax.world import clutter, scenes
 
 BATCHES = {"compact": 32, "paper": 8}
-"""Examples a step, the presets' own."""
-CANDIDATES, OBJECTS = 64, 10
+"""Examples per step, as in the presets."""
+CANDIDATES = 64
+"""Number of candidate pushes."""
+OBJECTS = 10
+"""Number of objects in a scene."""
 USES = 64
-"""Times that a training of 3,000 steps sees each of 1,500 pushes."""
+"""Number of times that a training of 3,000 steps uses each of 1,500 pushes."""
 
 
 def _task(folder: str, preset: str, seed: int) -> PushTask:
-    """A training task on a small data set of 1 to 7 objects."""
+    """Return a training task on a small data set of 1 to 7 objects."""
     data = pathlib.Path(folder) / "data"
     with quiet():
         generate(
@@ -54,7 +57,7 @@ def _task(folder: str, preset: str, seed: int) -> PushTask:
 
 
 def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of a training step in PyTorch over ours, and our peak memory over PyTorch's, same layers and inputs."""
+    """Measure seconds of a training step in PyTorch over ours, and our peak memory over PyTorch's."""
     if importlib.util.find_spec("torch") is None:
         raise Skipped("PyTorch is not installed; run pip install torch (the extra `bench`)")
     for preset, batch in BATCHES.items():
@@ -70,7 +73,7 @@ def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
 
 
 def input_share(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of rendering a batch and moving it into the push frame, over that and a step.
+    """Measure seconds of rendering a batch and moving it into the push frame, over that and a step.
 
     `/training` is what a training pays: examples of a `compact` network are rendered once, stay in memory, and are used
     `USES` times.
@@ -112,7 +115,7 @@ def input_share(setting: Setting) -> Iterator[tuple[str, float]]:
 
 
 def batched(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of one call for each candidate over one call for all: 64 pushes of a scene of 10 objects."""
+    """Measure seconds of one call for each candidate over one call for all: 64 pushes of a scene of 10 objects."""
     items = clutter.settled_scenes(jax.random.key(setting.seed), make_engine("native"), scenes.fixed_count(OBJECTS), 1)
     seen = jax.tree.map(lambda leaf: leaf[0], render.observe(items.scene, items.poses))
     key = jax.random.key(setting.seed)

@@ -1,5 +1,4 @@
-"""Trains one network in one framework, a few steps each time that it is asked to: a process of its own, so that its
-peak memory is its own.
+"""Train one network in one framework in a process of its own, so that its peak memory is its own.
 
 `python -m benchmarks.push_worker FRAMEWORK PRESET BATCH FILE.npz`: inputs `[B, ...]` and `target [B, N, 10, 3]` are in
 the file. See `benchmarks.worker` for what it reads and answers.
@@ -17,10 +16,11 @@ from benchmarks.worker import MOMENTUM, RATE, Step
 from dipn_jax.workspace import PUSH_STEPS
 
 FIELDS = ("push_map", "scene_map", "crops", "outlines", "centers", "present")
+"""Inputs that are sent to PyTorch."""
 
 
 def jax_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
-    """One step of SGD with momentum in JAX, and the number of parameters."""
+    """Return one step of SGD with momentum in JAX, and the number of parameters."""
     import jax.numpy as jnp
 
     from dipn_jax.networks import dipn, losses, push_frame
@@ -40,7 +40,7 @@ def jax_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
 
 
 def torch_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
-    """The same in PyTorch."""
+    """Return the same step in PyTorch."""
     import torch
 
     from benchmarks import torch_push
@@ -64,12 +64,12 @@ def torch_step(preset: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
 
 
 def _target(preset: str, target: np.ndarray) -> np.ndarray:
-    """What a network of this preset answers: `paper` one distance, `compact` all."""
+    """Return the targets of a network of this preset: `paper` predicts one distance, `compact` all."""
     return target[:, :, -1:] if preset == "paper" else target
 
 
 def main() -> None:
-    """Entry point of a worker."""
+    """Run a worker."""
     framework, preset, batch, file = sys.argv[1:]
     with np.load(file) as stored:
         arrays = {name: stored[name][: int(batch)] for name in stored}

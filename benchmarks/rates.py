@@ -1,4 +1,4 @@
-"""What a second brings, absolute: for the documentation of one machine, not for comparing two."""
+"""Absolute rates: to document one machine, not to compare two."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ from dipn_jax.physics.warp import WarpEngine
 from dipn_jax.world import primitives, scenes
 
 COUNTS = (1, 3, 7, 10, 20, 30)
+"""Numbers of objects."""
 FEW_ON_CPU = 4
-"""Episodes that XLA and Warp make of each kind on a CPU at small scale: their rate is below one a second."""
+"""Episodes of each kind that MJX and Warp make on a CPU at small scale, where their rate is below one per second."""
 BATCHES = (512, 1024, 2048, 4096)
-"""Heaps at once on an accelerator, for `scene_seconds`."""
-SPAN = 0.2
-"""Seconds that they are simulated."""
+"""Numbers of heaps simulated at once on an accelerator, for `scene_seconds`."""
+SIMULATED_SECONDS = 0.2
+"""Seconds for which they are simulated."""
 
 
 def _engine_kept(engine: EngineName) -> contextlib.AbstractContextManager[object]:
-    """Every data set makes its engine anew; within this, one stays that has its programs compiled.
+    """Make all data sets in this context use one engine, which keeps its compiled programs.
 
     The native one is left alone: it remembers models, which a second run of the same job must not find.
     """
@@ -45,7 +46,7 @@ def _engine_kept(engine: EngineName) -> contextlib.AbstractContextManager[object
 
 
 def rate(engine: EngineName, kind: str, objects: int, episodes: int, seed: int) -> float:
-    """Episodes on disk a second; what JAX compiles is not counted."""
+    """Measure episodes on disk per second; compilation by JAX is not counted."""
     scene = scenes.parse_objects(str(objects))
     shard = -(-episodes // (4 if engine == "native" else 2))
     job = generate.Job(
@@ -57,7 +58,7 @@ def rate(engine: EngineName, kind: str, objects: int, episodes: int, seed: int) 
 
 
 def _rates(engine: EngineName, setting: Setting, episodes: int) -> Iterator[tuple[str, float]]:
-    """`rates.ENGINE/KIND/OBJECTS`; fewer episodes of many objects."""
+    """Measure `rates.ENGINE/KIND/OBJECTS`; fewer episodes where there are many objects."""
     for kind in ("push", "grasp"):
         for objects in COUNTS:
             value = rate(engine, kind, objects, max(episodes * 7 // max(objects, 7), 4), setting.seed)
@@ -65,20 +66,20 @@ def _rates(engine: EngineName, setting: Setting, episodes: int) -> Iterator[tupl
 
 
 def scene_seconds(setting: Setting) -> Iterator[tuple[str, float]]:
-    """`engines.scene_seconds/ENGINE/BATCH`: seconds of heaps of seven objects simulated a second, by each engine."""
+    """Measure `engines.scene_seconds/ENGINE/BATCH`: seconds of heaps of seven objects simulated per second."""
     names: tuple[EngineName, ...] = ("native", "mjx", "warp")
     for name in names[: 3 if importlib.util.find_spec("warp") else 2]:
         for batch in (64,) if jax.default_backend() == "cpu" else BATCHES:
             scene, poses = heaps(setting.seed, batch)
-            still, end = primitives.parked_trajectory(batch, SPAN), np.array([SPAN])
+            still, end = primitives.parked_trajectory(batch, SIMULATED_SECONDS), np.array([SIMULATED_SECONDS])
             work = functools.partial(_sized(name, batch).simulate, scene, poses, still, end)
             work()  # compiles
             taken = statistics.median(seconds(work) for _ in range(setting.pick(1, 5)))
-            yield f"engines.scene_seconds/{name}/{batch}", batch * SPAN / taken
+            yield f"engines.scene_seconds/{name}/{batch}", batch * SIMULATED_SECONDS / taken
 
 
 def _sized(name: EngineName, batch: int) -> Engine:
-    """An engine that takes a whole batch at once, where that is for it to choose."""
+    """Return an engine that takes a whole batch at once, where its batch can be chosen."""
     if name == "mjx" and jax.default_backend() != "cpu":
         return MjxEngine(chunk=batch)
     if name == "warp":
@@ -87,18 +88,18 @@ def _sized(name: EngineName, batch: int) -> Engine:
 
 
 def native(setting: Setting) -> Iterator[tuple[str, float]]:
-    """MuJoCo C on all cores."""
+    """Measure the rates of MuJoCo C on all cores."""
     return _rates("native", setting, setting.pick(96, 960))
 
 
 def mjx(setting: Setting) -> Iterator[tuple[str, float]]:
-    """MJX, XLA."""
+    """Measure the rates of MJX, on XLA."""
     few = setting.pick(FEW_ON_CPU, 24)
     return _rates("mjx", setting, few if jax.default_backend() == "cpu" else setting.pick(384, 3840))
 
 
 def warp(setting: Setting) -> Iterator[tuple[str, float]]:
-    """MuJoCo Warp."""
+    """Measure the rates of MuJoCo Warp."""
     if importlib.util.find_spec("warp") is None:
         raise Skipped("MuJoCo Warp is not installed; run pip install 'dipn-jax[warp]'")
     few = setting.pick(FEW_ON_CPU, 24)

@@ -1,4 +1,4 @@
-"""The renderer against MuJoCo's ray caster: the same images of the same scenes."""
+"""The renderer against MuJoCo's ray caster on the same images of the same scenes."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from dipn_jax.structs import ABSENT, Observation, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import clutter, model, scenes
 
-OBJECTS, BATCH = 10, 16
+OBJECTS = 10
+"""Number of objects in a scene."""
+BATCH = 16
+"""Number of scenes."""
 CAMERA_HEIGHT = 1.0
-"""Metres above the table from which rays start."""
-AWAY = 3.0
-"""Metres above the table to which the gripper is lifted out of the view."""
+"""Height in metres above the table from which rays start."""
+GRIPPER_HEIGHT = 3.0
+"""Height in metres to which the gripper is lifted out of the view."""
 LABELS_EQUAL = 0.999
-"""Least share of pixels on which both must agree for their times to be compared."""
+"""Smallest share of pixels on which both must agree for their times to be compared."""
 
 
 class RayCaster:
-    """RGB, height and labels by one vertical ray a pixel.
+    """The images by MuJoCo: RGB, height and labels by one vertical ray per pixel.
 
     `mj_multiRay` sends all rays from one point, so an orthographic view needs `Batch.ray`, which spreads scenes
     over all cores.
@@ -41,7 +44,7 @@ class RayCaster:
         models = [mujoco.MjModel.from_xml_string(text) for text in texts]
         self.sims = mujoco_batch.Batch(models[0], nsim=len(models), nthread=cores())
         self.sims.set_models(models)
-        self.sims.qpos[:, 2] = AWAY
+        self.sims.qpos[:, 2] = GRIPPER_HEIGHT
         self.sims.qpos[:, model.GRIPPER_DOF :] = np.asarray(items.poses).reshape(len(models), -1)
         self.slot = models[0].geom_bodyid - models[0].body("o0").id  # of each geom; negative: no object
         at = (np.arange(WORKSPACE.pixels) - (WORKSPACE.pixels - 1) / 2) * WORKSPACE.pixel
@@ -51,7 +54,7 @@ class RayCaster:
         self.palette = np.concatenate([np.asarray(items.scene.color), table], 1)
 
     def observe(self) -> Observation:
-        """As `render.observe`, numpy."""
+        """Return observations as `render.observe` does, as NumPy arrays."""
         side = WORKSPACE.pixels
         distance, geom = self.sims.ray(self.origin, np.array([0.0, 0.0, -1.0]))
         slot = np.where(geom < 0, ABSENT, self.slot[geom])
@@ -69,7 +72,7 @@ def _same(ours: Observation, theirs: Observation) -> None:
 
 
 def vs_raycast(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Seconds of the ray caster over seconds of the renderer."""
+    """Measure seconds of the ray caster over seconds of the renderer."""
     key = jax.random.key(setting.seed)
     items = clutter.settled_scenes(key, make_engine("native"), scenes.fixed_count(OBJECTS), BATCH)
     caster = RayCaster(items)

@@ -1,4 +1,4 @@
-"""An episode on disk against the images that it stands for."""
+"""The size of an episode on disk against that of the images that it stands for."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from dipn_jax.structs import Observation, PushEpisode
 from dipn_jax.world import scenes
 
 OBJECTS = 10
+"""Number of objects in a scene."""
 DEPTH_UNIT = 1e-4
-"""Metres of one step of a 16-bit depth image."""
+"""Metres per step of a 16-bit depth image."""
 
 
 def png_bytes(seen: Observation) -> int:
-    """Bytes of colour and depth of observations `[B]` as PNGs."""
+    """Return the bytes of colour and depth of observations `[B]` as PNGs."""
     total = 0
     for color, height in zip(np.asarray(seen.color), np.asarray(seen.height), strict=True):
         eight = np.rint(color[..., ::-1] * 255).astype(np.uint8)
@@ -37,7 +38,7 @@ def png_bytes(seen: Observation) -> int:
 
 
 def image_bytes(episodes: PushEpisode, count: int) -> float:
-    """Mean bytes of the frames of an episode, from `count` of them."""
+    """Return the mean bytes of the frames of an episode, from `count` of them."""
     frames = np.asarray(episodes.poses).shape[1]
     total = 0
     for i in np.linspace(0, len(episodes.fault) - 1, count).astype(int):
@@ -48,7 +49,7 @@ def image_bytes(episodes: PushEpisode, count: int) -> float:
 
 
 def vs_images(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Bytes of a push episode, its share of the metadata included, over those of its images."""
+    """Measure bytes of a push episode, its share of the metadata included, over those of its images."""
     episodes = setting.pick(200, 1000)
     job = Job(
         kind="push",

@@ -1,4 +1,4 @@
-"""Both GNs in PyTorch, layer by layer as in `dipn_jax.networks.grasp`: what their speed is held against."""
+"""Both GNs in PyTorch, layer by layer as in `dipn_jax.networks.grasp`, to compare speeds with."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dipn_jax.workspace import ROTATIONS, WORKSPACE, grasp_angles
 
 
 class Paper(nn.Module):
-    """As `grasp._PaperTrunk`."""
+    """The network `grasp._PaperTrunk`."""
 
     def __init__(self, config: GraspConfig) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ class Paper(nn.Module):
 
 
 class Residual(nn.Module):
-    """As `resnet.PlainBlock`."""
+    """The block `resnet.PlainBlock`."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class Residual(nn.Module):
 
 
 class Compact(nn.Module):
-    """As `grasp._CompactTrunk`."""
+    """The network `grasp._CompactTrunk`."""
 
     def __init__(self, config: GraspConfig) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class Compact(nn.Module):
 
 
 def rotate(images: Tensor, angles: Tensor, size: int) -> Tensor:
-    """As `geometry.rotate_map` for each angle `[R]`: `[R, C, H, W]` to `[R, C, size, size]`, nearest neighbour."""
+    """Rotate `[R, C, H, W]` by each angle `[R]` to `[R, C, size, size]` as `geometry.rotate_map` does."""
     scale = size / images.shape[-1]
     c, s, zero = torch.cos(angles) * scale, torch.sin(angles) * scale, torch.zeros_like(angles)
     turn = torch.stack([torch.stack([c, -s, zero], -1), torch.stack([s, c, zero], -1)], 1)
@@ -93,7 +93,7 @@ def rotate(images: Tensor, angles: Tensor, size: int) -> Tensor:
 
 
 def score(network: nn.Module, image: Tensor) -> Tensor:
-    """As `grasp.score_image`: scores `[16, 224, 224]` of an image `[4, 224, 224]` whose table is 0."""
+    """Return scores `[16, 224, 224]` of an image `[4, 224, 224]` whose table is 0, as `grasp.score_image` does."""
     angles = torch.from_numpy(grasp_angles())
     views = rotate(image.expand(ROTATIONS, *image.shape), angles, VIEW_PIXELS)
     return rotate(torch.sigmoid(network(views))[:, None], -angles, WORKSPACE.pixels)[:, 0]

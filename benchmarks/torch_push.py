@@ -1,4 +1,4 @@
-"""Both DIPNs in PyTorch, layer by layer as in `dipn_jax.networks`: what their training speed is held against."""
+"""Both DIPNs in PyTorch, layer by layer as in `dipn_jax.networks`, to compare training speeds with."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Inputs = dict[str, Tensor]
 
 
 def mlp(features: int, sizes: Sequence[int], *, linear_end: bool = False) -> nn.Sequential:
-    """As `resnet.MLP`."""
+    """Return the layers of `resnet.MLP`."""
     layers: list[nn.Module] = []
     for i, size in enumerate(sizes):
         layers.append(nn.Linear(features, size))
@@ -31,7 +31,7 @@ def mlp(features: int, sizes: Sequence[int], *, linear_end: bool = False) -> nn.
 
 
 class Bottleneck(nn.Module):
-    """As `resnet.Bottleneck`."""
+    """The block `resnet.Bottleneck`."""
 
     def __init__(self, features: int, width: int, stride: int) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class Bottleneck(nn.Module):
 
 
 def resnet(features: int, stages: Sequence[int]) -> nn.Sequential:
-    """As `resnet.ResNet`, up to its last map averaged, `[B, 2048]`."""
+    """Return the network `resnet.ResNet`, up to its last map averaged, `[B, 2048]`."""
     layers: list[nn.Module] = [
         nn.Conv2d(features, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(), nn.MaxPool2d(3, 2, 1),
     ]  # fmt: skip
@@ -64,7 +64,7 @@ def resnet(features: int, stages: Sequence[int]) -> nn.Sequential:
 
 
 class Paper(nn.Module):
-    """As `dipn._Paper`."""
+    """The network `dipn._Paper`."""
 
     def __init__(self, config: DipnConfig) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class Paper(nn.Module):
 
 
 class Compact(nn.Module):
-    """As `stepwise.Stepwise`."""
+    """The network `stepwise.Stepwise`."""
 
     def __init__(self, config: DipnConfig) -> None:
         super().__init__()
@@ -136,21 +136,21 @@ class Compact(nn.Module):
         return torch.cat(course, 2)
 
     def turn(self, reach: Tensor, angle: Tensor) -> Tensor:
-        """As `stepwise.turn`."""
+        """Turn vectors as `stepwise.turn` does."""
         d = reach.shape[-2]
         back = torch.arange(d) - angle[..., None] * (d / (2 * np.pi))
         apart = torch.abs((back[..., :, None] - torch.arange(d) + d / 2) % d - d / 2)
         return torch.relu(1 - apart) @ reach
 
     def gaps(self, offset: Tensor, first: Tensor, second: Tensor) -> Tensor:
-        """As `stepwise.gaps`, in the network's unit."""
+        """Return gaps as `stepwise.gaps` does, in the network's unit."""
         gap = offset @ self.normals.T - first - torch.roll(second, OUTLINE_DIRECTIONS // 2, -1)
         return torch.clamp(gap, stepwise.LEAST_GAP, stepwise.LARGEST_GAP) * stepwise.GAP_SCALE
 
     def advance(
         self, hidden: Tensor, ahead: Tensor, place: Tensor, reach: Tensor, others: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """As `Stepwise._advance`."""
+        """Advance one step as `Stepwise._advance` does."""
         whole = reach[..., 0]
         gripper = [self.gaps(ahead, self.gripper, reach[..., k]) for k in range(2)]
         state = functional.relu(
@@ -174,5 +174,5 @@ class Compact(nn.Module):
 
 
 def _others(present: Tensor) -> Tensor:
-    """As `dipn._others`, `[B, N, N, 1]` float."""
+    """Return which objects are others, `[B, N, N, 1]` float, as `dipn._others` does."""
     return (present[:, None] & ~torch.eye(present.shape[1], dtype=torch.bool))[..., None].float()

@@ -13,14 +13,16 @@ from typing import Any
 
 from benchmarks.harness import alternate
 
-RATE, MOMENTUM = 1e-3, 0.9
+RATE = 1e-3
+"""Learning rate of SGD."""
+MOMENTUM = 0.9
+"""Momentum of SGD."""
 Step = Callable[[], None]
+"""Takes one step, and returns when it is done."""
 
 
 def serve(step: Step, parameters: int) -> None:
-    """Answer a line with a number on standard input by the seconds that so many steps took, and the end of input by
-    the number of parameters and the highest resident memory in MiB.
-    """
+    """Print the seconds of as many steps as each line of standard input says; at its end, parameters and memory."""
     for line in sys.stdin:
         begun = time.perf_counter()
         for _ in range(int(line)):
@@ -30,7 +32,7 @@ def serve(step: Step, parameters: int) -> None:
 
 
 def sgd(model: Any, loss: Callable[[Any], Any]) -> tuple[Step, int]:
-    """A step of SGD with momentum on `loss` (of a network in flax.nnx), jitted; and the number of parameters."""
+    """Return a jitted step of SGD with momentum on `loss` (of a network in flax.nnx), and the number of parameters."""
     import jax
     import optax
     from flax import nnx
@@ -58,7 +60,7 @@ def sgd(model: Any, loss: Callable[[Any], Any]) -> tuple[Step, int]:
 
 
 def peak_memory() -> float:
-    """Highest resident memory of this process, MiB; `ru_maxrss` would also count the parent's before the fork."""
+    """Return the highest resident memory of this process in MiB; `ru_maxrss` would include the parent's."""
     status = pathlib.Path("/proc/self/status")
     if status.exists():
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
@@ -77,14 +79,14 @@ class Worker:
         self.steps(1)
 
     def steps(self, count: int) -> float:
-        """Seconds that so many steps take."""
+        """Return the seconds that `count` steps take."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{count}\n")
         self.process.stdin.flush()
         return float(self._line())
 
     def close(self) -> tuple[int, float]:
-        """Number of parameters, and peak memory in MiB."""
+        """End the process and return its number of parameters and its peak memory in MiB."""
         assert self.process.stdin is not None
         self.process.stdin.close()
         parameters, memory = self._line().split()
@@ -102,7 +104,7 @@ class Worker:
 def versus(
     figure: str, module: str, arguments: tuple[object, ...], *, batch: int, count: int, repeats: int
 ) -> Iterator[tuple[str, float]]:
-    """`FIGURE`: seconds of a training step in PyTorch over ours; samples a second, and our memory over PyTorch's.
+    """Measure seconds of a training step in PyTorch over ours, as `FIGURE`; also samples per second and memory.
 
     Raises:
       RuntimeError: the two networks have different numbers of parameters.

@@ -1,4 +1,4 @@
-"""`dipn-datagen`: push, grasp, images, check-world, verify, repair, info."""
+"""The program `dipn-datagen`: push, grasp, images, check-world, verify, repair, info."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ if TYPE_CHECKING:
     from .generate import Job
 
 Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
+"""Number of objects in a scene."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """Which engine makes a data set, and which part of it."""
+    """The engine that makes a data set, and the part of it that this worker makes."""
 
     engine: EngineName = "auto"
     """native (CPU), mjx (XLA), warp (NVIDIA), or auto."""
@@ -38,6 +39,7 @@ class Work:
 
 
 DEFAULT_WORK = Work()
+"""One worker that makes everything, with the engine that is faster here."""
 
 
 def _generate(job: Job, out: pathlib.Path, work: Work, *, scorer: Scorer | None = None) -> None:
@@ -57,7 +59,7 @@ def push(
     ranges: Ranges = DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
-    """Push episodes: a settled scene, one 10 cm push, poses at every centimetre.
+    """Make push episodes: a settled scene, one 10 cm push, poses at every centimetre.
 
     About two minutes on two cores for 1,500 episodes:
       dipn-datagen push --out data/push --episodes 1500
@@ -66,14 +68,14 @@ def push(
       dipn-datagen push --out data/sweep --distances 0.03 0.06 0.1 --shard-size 300
 
     Args:
-      out: folder of the data set; asking again continues or extends it.
-      episodes: how many.
+      out: folder of the data set; the same command continues, more --episodes extend it.
+      episodes: number of episodes.
       objects: number of objects in a scene.
-      seed: seed of everything random.
+      seed: random seed of everything.
       actions: different pushes tried on each settled scene.
       distances: metres, up to 0.1; every push is made once for each of them, from the same settled scene.
       shard_size: episodes in a file; files are the unit of resuming and of sharing work.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
     from dipn_jax.world import scenes
@@ -107,7 +109,7 @@ def grasp(
     ranges: Ranges = DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
-    """Grasp episodes: a settled scene, one grasp, held or not.
+    """Make grasp episodes: a settled scene, one grasp, held or not.
 
     At random foreground pixels and angles; 3,000 episodes take about three minutes on two cores:
       dipn-datagen grasp --out data/grasp --episodes 3000
@@ -116,20 +118,20 @@ def grasp(
       dipn-datagen grasp --grasp-net runs/gn-pretrained --out data/guided --episodes 12000
 
     Args:
-      out: folder of the data set; asking again continues or extends it.
-      episodes: how many.
+      out: folder of the data set; the same command continues, more --episodes extend it.
+      episodes: number of episodes.
       objects: number of objects in a scene.
-      seed: seed of everything random.
+      seed: random seed of everything.
       actions: different grasps tried on each settled scene.
       shard_size: episodes in a file.
       grasp_net: run of dipn-train, or builtin; none: all grasps are random.
       guided: share of grasps that it scores high, 0.5 unless given.
       hard: share of grasps that it is unsure of, 0.25 unless given.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
     if grasp_net is None and (guided is not None or hard is not None):
-        raise UserError("--guided and --hard are shares of what a network believes: give --grasp-net, too")
+        raise UserError("--guided and --hard are shares of grasps that a network chooses: give --grasp-net, too")
     from dipn_jax.world import scenes
 
     from .generate import Job
@@ -154,7 +156,7 @@ def grasp(
 def _generate_guided(
     job: Job, out: pathlib.Path, work: Work, grasp_net: pathlib.Path, *, guided: float, hard: float
 ) -> None:
-    """Generate grasps of which a network chooses the shares `guided` and `hard`."""
+    """Generate grasps, the shares `guided` and `hard` of which a network chooses."""
     from dipn_jax.planning import scorers
     from dipn_jax.storage import checkpoint
 
@@ -174,17 +176,17 @@ def images(
     ranges: Ranges = DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
-    """Settled scenes without an action, for GN's pre-training on images.
+    """Make settled scenes without an action, for GN's pre-training on images.
 
       dipn-datagen images --out data/images --episodes 100
 
     Args:
-      out: folder of the data set; asking again continues or extends it.
-      episodes: how many scenes.
+      out: folder of the data set; the same command continues, more --episodes extend it.
+      episodes: number of scenes.
       objects: number of objects in a scene.
-      seed: seed of everything random.
+      seed: random seed of everything.
       shard_size: scenes in a file.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
     from dipn_jax.world import scenes
@@ -212,18 +214,18 @@ def check_world(
     tries: int = 100,
     seed: int = 0,
 ) -> None:
-    """Measure whether the world is right: drops, grasps, pushes, the camera, and how far the engines agree.
+    """Measure whether the simulated world is right: drops, grasps, pushes, the camera, and how far the engines agree.
 
     About ten minutes on two cores; the results of the last run are in docs/world.md:
       dipn-datagen check-world --out results/world
 
     Args:
-      out: folder for metrics.json and world.md; asking again continues where it stopped.
+      out: folder for metrics.json and world.md; the same command continues where it stopped.
       engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
       scenes_: scenes with a push and a grasp each.
       few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
       tries: grasps of every catalogue item.
-      seed: seed of everything random.
+      seed: random seed of everything.
     """
     from . import check
 
@@ -279,10 +281,11 @@ COMMANDS = {
     "repair": repair,
     "info": info,
 }
+"""The commands of `dipn-datagen`, by name."""
 
 
 def main() -> None:
-    """Entry point."""
+    """Run `dipn-datagen` and exit with its exit code."""
     sys.exit(console.run("Generate push and grasp episodes with rigid-body physics.", COMMANDS))
 
 

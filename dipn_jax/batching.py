@@ -38,8 +38,7 @@ def in_batches(function: Callable[..., Any], *args: Any) -> Any:
 
 
 def in_small_batches(function: Callable[..., Any], *args: Any) -> Any:
-    """Return `function(*args)` as `in_batches` does, SMALL_BATCH rows at a time; for functions whose rows are
-    expensive.
+    """Return `function(*args)` as `in_batches` does, always SMALL_BATCH rows at a time, for expensive rows.
 
     `function(*rows, real)` also gets `real [SMALL_BATCH]` bool: which of its rows are rows of `args`. The others only
     fill the batch up.

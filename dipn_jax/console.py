@@ -232,9 +232,7 @@ def exit_code(work: Callable[[], int | None]) -> int:
 
 
 def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> None:
-    """Call the command that `arguments` name. Its own help is complete; the list of all commands gives each one
-    sentence.
-    """
+    """Call the command that `arguments` name; its own help is complete, the list of all gives a sentence each."""
     choices = tuple(
         Annotated[
             Any,

@@ -24,9 +24,9 @@ class PhysicsConfig:
     cone: str = "elliptic"  # or pyramidal
     solref: str = "0.01 1"  # softer makes grasps wrong
     solimp: str = "0.95 0.99 0.001"
-    sleep: float = 0.0  # m/s below which resting objects are left out of a step until something comes (0: never)
-    geom_pairs: tuple[int, int] | None = None  # MJX: pairs kept by the broad phase: at least, and an object
-    contact_points: tuple[int, int] | None = None  # MJX: contacts kept, likewise (None: all)
+    sleep: float = 0.0  # m/s below which resting objects are left out of steps until they are touched (0: never)
+    geom_pairs: tuple[int, int] | None = None  # MJX: pairs kept by the broad phase: at least, and per object
+    contact_points: tuple[int, int] | None = None  # MJX: contacts kept: at least, and per object (None: all)
 
     def caps(self, slots: int) -> tuple[int, int]:
         """Return how many geom pairs and contacts MJX keeps with `slots` objects; -1 means all."""

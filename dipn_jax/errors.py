@@ -10,5 +10,5 @@ class UserError(Exception):
       try:
           policy = dipn_jax.load_policy("vpg")
       except dipn_jax.UserError as error:
-          print(error)        # --method vpg: wants --value-net; give a run of dipn-train baseline
+          print(error)        # --method vpg: needs --value-net; give a run of dipn-train baseline
     """

@@ -105,6 +105,6 @@ def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] 
             key = different[0]
             raise UserError(
                 f"{out}: begun with {key}={theirs.get(key)}, asked for {key}={mine[key]}; give another --out, or the "
-                "same options and data to go on"
+                "same options and data to continue"
             )
     write_json(path, mine)

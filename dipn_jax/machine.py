@@ -22,9 +22,7 @@ def cores() -> int:
 
 
 def commit() -> str:
-    """Return the commit of these sources, with `-dirty` if a Python file differs from it; `unknown` outside a
-    checkout.
-    """
+    """Return the commit of these sources, `-dirty` if a Python file differs from it; `unknown` outside a checkout."""
     git = ["git", "-C", str(pathlib.Path(__file__).parent.parent)]
     try:
         head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)

@@ -172,7 +172,7 @@ class PushEpisode(Pytree):
     """One push, with everything needed to render it before, during and after."""
 
     scene: Scene
-    poses: Float[Array, "*b 11 N 7"]  # at 0, 1, ..., 10 cm of travel; past `push.distance`, as often (every 0.1 s)
+    poses: Float[Array, "*b 11 N 7"]  # at 0, 1, ..., 10 cm of travel (every 0.1 s, also after `push.distance`)
     after: Float[Array, "*b N 7"]  # at rest, the gripper gone
     push: Push
     fault: Int[Array, "*b"]  # bits of Fault
@@ -209,7 +209,7 @@ class Candidates(Pytree):
     grasp_pixel: Int[Array, "*b 3"]  # rotation, row, col of the best grasp
     grasp_score: Float[Array, "*b"]  # score of that grasp in [0, 1]
     value_now: Float[Array, "*b"]  # mean score of all grasps
-    grasp_now: Bool[Array, "*b"]  # the best grasp is to be taken, whatever pushes promise
+    grasp_now: Bool[Array, "*b"]  # whether to take the best grasp without comparing pushes
 
 
 @flax.struct.dataclass

@@ -1,4 +1,4 @@
-"""`dipn-eval`: prediction, grasp, clear, sweep, report."""
+"""The program `dipn-eval`: prediction, grasp, clear, sweep, report."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ COMMANDS = {
     "sweep": clearing.sweep,
     "report": report.report,
 }
+"""The commands of `dipn-eval`, by name."""
 
 
 def main() -> None:
-    """Entry point."""
+    """Run `dipn-eval` and exit with its exit code."""
     sys.exit(console.run("Measure predictors, grasps and whole policies; write the report.", COMMANDS))
 
 

@@ -28,7 +28,7 @@ PUSH_MEASURES = (
     "push_position_mm",
     "push_angle_deg",
 )
-"""What `push_errors` measures of each network; the figure shows the first two."""
+"""Measures of `push_errors` for each network; the figure shows the first two."""
 _PUSH_COLUMNS = (
     ("push_error", "1 - IoU", 3),
     ("push_error_paper_measure", "XOR / 2 true", 3),
@@ -38,11 +38,11 @@ _PUSH_COLUMNS = (
 )
 """Measure, title and decimals of each column of the table of pushes."""
 GRASP_GROUPS = {"with": "with pre-training", "without": "without pre-training"}
-"""Names of the two curves of grasps, and their titles."""
+"""Keys and titles of the two curves of grasps."""
 
 
 def load_push_runs(runs: Sequence[pathlib.Path]) -> dict[str, DIPN]:
-    """The networks of `dipn-train push` runs by `PUSHES/SEED`, in order.
+    """Load the networks of `dipn-train push` runs by `PUSHES/SEED`, in order.
 
     Raises:
       UserError: a folder holds no such run, one that has not ended, or two are of the same pushes and seed.
@@ -54,9 +54,9 @@ def load_push_runs(runs: Sequence[pathlib.Path]) -> dict[str, DIPN]:
         plan = run / "config.json"
         planned = files.read_json(plan).get("steps", 0) if plan.exists() else 0
         if planned > meta["step"]:
-            raise UserError(f"--curve {run}: stopped at step {meta['step']} of {planned}; let its command end first")
+            raise UserError(f"--curve {run}: stopped at step {meta['step']} of {planned}; run its command to the end")
         if "examples" not in meta:
-            raise UserError(f"--curve {run}: its checkpoint does not say how many pushes it is of; train again")
+            raise UserError(f"--curve {run}: its checkpoint does not name its number of pushes; train again")
         key = (int(meta["examples"]), int(meta["seed"]))
         if key in found:
             raise UserError(f"--curve {run}: a second run of {key[0]} pushes with seed {key[1]}; give one of each")
@@ -65,7 +65,10 @@ def load_push_runs(runs: Sequence[pathlib.Path]) -> dict[str, DIPN]:
 
 
 def load_grasp_runs(runs: Sequence[pathlib.Path]) -> dict[str, dict[int, list[float]]]:
-    """Success over the last grasps of `dipn-train grasp-online` runs: by GRASP_GROUPS and grasps, one value a seed.
+    """Read the success over the last grasps of `dipn-train grasp-online` runs, one value per seed.
+
+    Returns:
+      Success by key of GRASP_GROUPS and number of grasps.
 
     Raises:
       UserError: a folder is no run of `dipn-train grasp-online`.
@@ -86,7 +89,7 @@ def load_grasp_runs(runs: Sequence[pathlib.Path]) -> dict[str, dict[int, list[fl
 
 
 def push_summary(values: dict[str, float], names: Sequence[str]) -> dict[str, float]:
-    """`values` of networks `names` (`PUSHES/SEED`) as `MEASURE/curve/PUSHES/DISTANCE/WHICH/{mean,std,seeds}`."""
+    """Summarize networks called `PUSHES/SEED` as `MEASURE/curve/PUSHES/DISTANCE/WHICH/{mean,std,seeds}`."""
     result: dict[str, float] = {}
     for measure in PUSH_MEASURES:
         for pushes in sorted({int(name.split("/")[0]) for name in names}):
@@ -99,7 +102,7 @@ def push_summary(values: dict[str, float], names: Sequence[str]) -> dict[str, fl
 
 
 def grasp_summary(found: dict[str, dict[int, list[float]]]) -> dict[str, float]:
-    """What `load_grasp_runs` found, as `online/{with,without}/GRASPS/{mean,std,seeds}`."""
+    """Summarize what `load_grasp_runs` found as `online/{with,without}/GRASPS/{mean,std,seeds}`."""
     result: dict[str, float] = {}
     for name, group in found.items():
         for grasps, each in sorted(group.items()):
@@ -108,23 +111,23 @@ def grasp_summary(found: dict[str, dict[int, list[float]]]) -> dict[str, float]:
 
 
 def _band(place: str, each: Sequence[float]) -> dict[str, float]:
-    """Mean, standard deviation (of a sample, n - 1; 0 for one seed) and number of the values of several seeds."""
+    """Return mean, standard deviation (of a sample, n - 1; 0 for one seed) and number of values."""
     std = float(np.std(each, ddof=1)) if len(each) > 1 else 0.0
     return {f"{place}/mean": float(np.mean(each)), f"{place}/std": std, f"{place}/seeds": len(each)}
 
 
 def _counts(values: dict[str, Any], begin: str) -> list[int]:
-    """The numbers of pushes or grasps that follow `begin` in the names of metrics, in order."""
+    """Return the numbers of pushes or grasps that follow `begin` in the names of metrics, in order."""
     return sorted({int(key[len(begin) :].split("/")[0]) for key in values if key.startswith(begin)})
 
 
 def _means(values: dict[str, Any], places: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation at each of `places`."""
+    """Return mean and standard deviation at each of `places`."""
     return tuple(np.array([values[f"{place}/{key}"] for place in places]) for key in ("mean", "std"))  # type: ignore[return-value]
 
 
 def push_figure(values: dict[str, Any], *, which: str = "all") -> Any:
-    """Curves of two error measures at both distances, baselines as lines, as a Matplotlib figure.
+    """Plot two error measures at both distances, baselines as lines, as a Matplotlib figure.
 
     Args:
       values: metrics with `push_summary`'s keys and the baselines'.
@@ -151,7 +154,7 @@ def push_figure(values: dict[str, Any], *, which: str = "all") -> Any:
 
 
 def grasp_figure(values: dict[str, Any]) -> Any:
-    """Success against grasps, with and without pre-training, as a Matplotlib figure."""
+    """Plot success against grasps, with and without pre-training, as a Matplotlib figure."""
     made, axis = plt.subplots(figsize=(6, 4))
     for name, title in GRASP_GROUPS.items():
         counts = _counts(values, f"online/{name}/")
@@ -169,7 +172,7 @@ def grasp_figure(values: dict[str, Any]) -> Any:
 
 
 def push_table(values: dict[str, Any], *, which: str = "all") -> str:
-    """The numbers of the figure, and more, as Markdown: mean and standard deviation over seeds.
+    """Return the numbers of the figure, and more, as Markdown: mean and standard deviation over seeds.
 
     Args:
       values: metrics with `push_summary`'s keys and the baselines'.
@@ -194,7 +197,7 @@ def push_table(values: dict[str, Any], *, which: str = "all") -> str:
 
 
 def grasp_table(values: dict[str, Any], counts: Sequence[int]) -> str:
-    """Success after each of `counts` grasps, as Markdown."""
+    """Return the success after each of `counts` grasps as Markdown."""
     rows = [["", *(f"{n} grasps" for n in counts)]]
     for name, title in GRASP_GROUPS.items():
         cells = []
@@ -206,6 +209,6 @@ def grasp_table(values: dict[str, Any], counts: Sequence[int]) -> str:
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A table; the first row is its head."""
+    """Return a Markdown table; the first row is its head."""
     lines = ["| " + " | ".join(row).lstrip() + " |" for row in rows]
     return "\n".join([lines[0], "| --- " * len(rows[0]) + "|", *lines[1:]]) + "\n"

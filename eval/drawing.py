@@ -1,4 +1,4 @@
-"""Pieces of a page: tables, pictures, and what is drawn on a picture."""
+"""Parts of a page: tables, pictures, and what is drawn on a picture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dipn_jax.workspace import WORKSPACE
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
-    """An HTML table of plain text."""
+    """Return an HTML table of plain text."""
 
     def line(cells: list[str], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
@@ -29,7 +29,7 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def percent(values: Mapping[str, Any], measure: str) -> str:
-    """A share as per cent, with its interval if there is one."""
+    """Return a share in per cent as text, with its interval if there is one."""
     value = values.get(measure)
     if value is None or not np.isfinite(value):
         return "-"
@@ -39,7 +39,7 @@ def percent(values: Mapping[str, Any], measure: str) -> str:
 
 
 def image(figure: Any, path: pathlib.Path) -> str:
-    """The figure as an HTML image with its content inside; also kept at `path`."""
+    """Return a figure as an HTML image with its content inside; also write it to `path`."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)
@@ -48,7 +48,7 @@ def image(figure: Any, path: pathlib.Path) -> str:
 
 
 def show(axis: Any, picture: np.ndarray, title: str = "") -> None:
-    """A picture `[224, 224, 3]` of the workspace, y up."""
+    """Draw a picture `[224, 224, 3]` of the workspace, y up."""
     half = WORKSPACE.half
     axis.imshow(picture, origin="lower", extent=(-half, half, -half, half), interpolation="nearest")
     axis.set(xticks=[], yticks=[], xlim=(-half, half), ylim=(-half, half))
@@ -56,14 +56,14 @@ def show(axis: Any, picture: np.ndarray, title: str = "") -> None:
 
 
 def arrow(axis: Any, push: np.ndarray) -> None:
-    """A push: x, y (metres), angle (radians), distance (metres)."""
+    """Draw a push: x, y (metres), angle (radians), distance (metres)."""
     x, y, angle, distance = (float(v) for v in push)
     step = (distance * np.cos(angle), distance * np.sin(angle))
     axis.annotate("", (x + step[0], y + step[1]), (x, y), arrowprops={"arrowstyle": "-|>", "color": "white", "lw": 2.5})
 
 
 def jaws(axis: Any, grasp: np.ndarray) -> None:
-    """The two fingers of a grasp: rotation, row, column."""
+    """Draw the two fingers of a grasp: rotation, row, column."""
     angle = grasp[0] * 2 * np.pi / 16
     x, y = ((grasp[[2, 1]] + 0.5) * WORKSPACE.pixel) - WORKSPACE.half
     for side in (-1, 1):

@@ -1,4 +1,4 @@
-"""Numbers: intervals and the flat `metrics.json` of every evaluation."""
+"""Confidence intervals, and the flat `metrics.json` of every evaluation."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import numpy as np
 from dipn_jax import files
 
 RESAMPLES = 2000
+"""Number of bootstrap resamples."""
 
 
 def ratio_interval(hits: np.ndarray, trials: np.ndarray, *, seed: int = 0) -> tuple[float, float, float]:
-    """sum(hits) / sum(trials) over instances, with a bootstrap 95 % interval over instances.
+    """Return sum(hits) / sum(trials) over instances, with a bootstrap 95 % interval over instances.
 
     Args:
       hits: `[I]` per instance.
       trials: `[I]` per instance.
-      seed: of the resampling.
+      seed: random seed of the resampling.
 
     Returns:
       Estimate, low, high; NaN where there is no trial.
@@ -41,7 +42,7 @@ def write(out: pathlib.Path, values: dict[str, Any], *, settings: dict[str, Any]
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:
-    """The flat metrics of an evaluation.
+    """Return the flat metrics of an evaluation.
 
     Raises:
       UserError: there are none.

@@ -1,4 +1,4 @@
-"""What the commands of `dipn-eval` share: options, their checks, results that are written. Imports no JAX."""
+"""Options of several commands of `dipn-eval`, their checks, and how results are written. Imports no JAX."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `pa
 
 
 def check(out: pathlib.Path, seed: int, **counts: int) -> None:
-    """Refuse counts that are not positive, a seed that is not one, an `out` that cannot be a folder."""
+    """Raise a UserError for counts that are not positive, a wrong seed, or an `out` that cannot be a folder."""
     console.require_positive(**counts)
     console.require_seed(seed)
     console.require_out(out)
 
 
 def plain(value: Any) -> Any:
-    """An option as JSON can hold it."""
+    """Return an option as JSON can hold it."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""Clearing: every method with the paper's samples and with more, and everything else on docs/clearing.md.
+"""Clearing: every method with the paper's samples and with more, and all other results on docs/clearing.md.
 
     python -m experiments.clearing          # or make clear-figures
 
@@ -39,7 +39,7 @@ BUILTIN = "--push-net builtin --grasp-net builtin"
 
 
 def list_runs(root: pathlib.Path) -> list[Run]:
-    """The runs of the page, which write to `root`/clear."""
+    """Return the runs of the page, which write to `root`/clear."""
     run = Recipe(root / "clear")
     pushes = run.borrow(push_prediction.list_runs(root), "data", prefix="push")
     pretrained = run.borrow(grasping.list_runs(root), "pretrained", prefix="grasp")
@@ -56,7 +56,7 @@ def list_runs(root: pathlib.Path) -> list[Run]:
 
 
 def _paper_samples(run: Recipe, pushes: pathlib.Path, pretrained: pathlib.Path) -> list[pathlib.Path]:
-    """Every method with the samples that the paper gives it, beside the shipped networks; returns the evaluations."""
+    """Add every method with the samples that the paper gives it, and the shipped networks; return the evaluations."""
     gn = run("gn", "dipn-train grasp-online --grasps 500 --init", pretrained)
     dipn = run("dipn", "dipn-train push --limit 1500 --steps 3000 --data", pushes)
     dipn_2000 = run("dipn-2000", "dipn-train push --limit 2000 --steps 3000 --data", pushes)
@@ -75,7 +75,7 @@ def _paper_samples(run: Recipe, pushes: pathlib.Path, pretrained: pathlib.Path) 
 
 
 def _more_samples(run: Recipe) -> list[pathlib.Path]:
-    """The compared methods with more samples, and the shipped GN without pushes; returns the evaluations."""
+    """Add the compared methods with more samples, and the shipped GN without pushes; return the evaluations."""
     dqn = run("dqn-large", "dipn-train baseline --method dqn --actions 3000 --grasp-net builtin")
     rea = run("rea-large", "dipn-train baseline --method rea --actions 3000")
     vpg = run("vpg-large", "dipn-train baseline --method vpg --actions 4000")
@@ -90,7 +90,7 @@ def _more_samples(run: Recipe) -> list[pathlib.Path]:
 
 
 def _evaluate(run: Recipe, methods: dict[str, tuple[Part, ...]], tables: dict[str, str]) -> list[pathlib.Path]:
-    """Each of `methods` on each of `tables`."""
+    """Add an evaluation of each of `methods` on each of `tables`."""
     return [
         run(f"table/{method}-{on}", "dipn-eval clear", which, *options)
         for on, which in tables.items()
@@ -116,7 +116,7 @@ def _cell(values: dict[str, Any], at: str) -> str:
 
 
 def table(values: dict[str, Any], tables: str) -> str:
-    """All methods on one kind of tables, %, and the paper's numbers of the same."""
+    """Return a table of all methods on one kind of tables, in per cent, with the paper's numbers for the same."""
     heads = [f"| {tables} | tables | pushes | " + " | ".join(TITLES.values()) + " |"]
     lines = [*heads, "| --- " * (len(TITLES) + 3) + "|"]
     for at in sorted({key.rpartition("/")[0] for key in values if key.startswith(f"clear/{tables}/")}):
@@ -130,12 +130,12 @@ def table(values: dict[str, Any], tables: str) -> str:
 
 
 def tables(values: dict[str, Any]) -> list[str]:
-    """All tables of the page."""
+    """Return all tables of the page."""
     return [table(values, kind) for kind in sorted({key.split("/")[1] for key in values if key.startswith("clear/")})]
 
 
 def swept(values: dict[str, Any]) -> str:
-    """What `dipn-eval sweep` found at each distance, %; prediction errors are true 1-IoU of objects that move."""
+    """Return a table of what `dipn-eval sweep` found at each distance; errors are true 1-IoU of moved objects."""
     lines = ["| push | error, moved objects | completion | grasp success | efficiency | pushes |", "| --- " * 6 + "|"]
     for each in sweeping.names(values):
         at = f"sweep/{each}"
@@ -162,7 +162,7 @@ def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command line and return the exit code."""
     return command.main("clearing", str(__doc__), list_runs, page=write_page, arguments=arguments)
 
 

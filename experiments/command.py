@@ -1,4 +1,4 @@
-"""The command line that every experiment shares."""
+"""The command line of every experiment."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from experiments import runs
 from experiments.runs import Run
 
 ListRuns = Callable[[pathlib.Path], list[Run]]
-"""The runs of an experiment, in order, for the folder that all results stand in."""
+"""Returns the runs of an experiment, in order, for the folder of all results."""
 
 WritePage = Callable[[pathlib.Path], None]
-"""Writes an experiment's page from what its runs left in that folder."""
+"""Writes an experiment's page from the results of its runs in that folder."""
 
 
 def main(
@@ -26,7 +26,7 @@ def main(
     page: WritePage | None = None,
     arguments: Sequence[str] | None = None,
 ) -> int:
-    """Entry point of an experiment; returns the exit code.
+    """Run the command line of an experiment and return the exit code.
 
     Args:
       module: its name, for the help.
@@ -79,7 +79,7 @@ def _show(chosen: Sequence[Run]) -> int:
 
 
 def _rehearse(chosen: Sequence[Run], found: dict[str, str]) -> int:
-    """Parse every command as it would be; say which are complete."""
+    """Parse every command with its own parser, without running it, and say which runs are complete."""
     for number, run in enumerate(chosen, 1):
         runs.parse(run)
         state = "complete" if runs.is_complete(run, found[run.name]) else run.line

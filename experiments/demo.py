@@ -1,4 +1,4 @@
-"""The demo: a small data set of each kind, both networks, what they are worth, and one report of it all.
+"""The demo: a small data set of each kind, both networks, their evaluations, and one report.
 
     python -m experiments.demo          # or make demo, which also sets up .venv
 
@@ -17,7 +17,7 @@ from experiments.runs import Recipe, Run
 
 
 def list_runs(root: pathlib.Path) -> list[Run]:
-    """The demo's commands, which write to `root`."""
+    """Return the demo's commands, which write to `root`."""
     run = Recipe(root)
 
     # episodes
@@ -47,7 +47,7 @@ def list_runs(root: pathlib.Path) -> list[Run]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command line and return the exit code."""
     return command.main("demo", str(__doc__), list_runs, folder="demo", arguments=arguments)
 
 

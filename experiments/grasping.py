@@ -1,4 +1,4 @@
-"""Grasping: the learning curves, the network that comes with the package and everything else on docs/grasping.md.
+"""Grasping: the learning curves, the network that comes with the package, and all other results on docs/grasping.md.
 
     python -m experiments.grasping          # or make grasp-figures
 
@@ -30,7 +30,7 @@ NO_ARCHES = (
 
 
 def list_runs(root: pathlib.Path) -> list[Run]:
-    """The runs of the page, which write to `root`/grasp."""
+    """Return the runs of the page, which write to `root`/grasp."""
     run = Recipe(root / "grasp")
     images = run("images", "dipn-datagen images --episodes 100")
     pretrained = run("pretrained", "dipn-train grasp-pretrain --steps 400 --data", images)
@@ -43,7 +43,7 @@ def list_runs(root: pathlib.Path) -> list[Run]:
 
 
 def _online(run: Recipe, pretrained: pathlib.Path) -> None:
-    """Learning while grasping: eight seeds with pre-training, three without."""
+    """Add the runs of learning while grasping: eight seeds with pre-training, three without."""
     online = "dipn-train grasp-online --grasps 400 --seed"
     learnt = [run(f"runs/with-{seed}", online, f"{seed} --init", pretrained) for seed in range(8)]
     learnt += [run(f"runs/without-{seed}", online, f"{seed}") for seed in range(3)]
@@ -51,7 +51,7 @@ def _online(run: Recipe, pretrained: pathlib.Path) -> None:
 
 
 def _shipped(run: Recipe, pretrained: pathlib.Path) -> pathlib.Path:
-    """The network that comes with the package: five data sets, the grasps of each chosen by the network before it."""
+    """Add the runs of the shipped network: five data sets, the grasps of each chosen by the network before it."""
     train = "dipn-train grasp --batch 64 --data"
     first = run("first", "dipn-datagen grasp --actions 6 --objects 1:12 --episodes 12000 --grasp-net", pretrained)
     once = run("once", train, first, "--steps 1500 --learning-rate 2e-3 --init", pretrained)
@@ -77,7 +77,7 @@ def _shipped(run: Recipe, pretrained: pathlib.Path) -> pathlib.Path:
 
 
 def _without_arches(run: Recipe) -> None:
-    """A network trained without arches, on arches."""
+    """Add a network trained without arches, and its evaluation on arches."""
     images = run("no-arches/images", f"dipn-datagen images --items {NO_ARCHES} --episodes 100")
     pretrained = run("no-arches/pretrained", "dipn-train grasp-pretrain --steps 400 --data", images)
     chosen = f"dipn-datagen grasp --actions 6 --items {NO_ARCHES} --objects 1:12 --episodes 5000 --grasp-net"
@@ -89,21 +89,21 @@ def _without_arches(run: Recipe) -> None:
 
 
 COUNTS = (50, 100, 200, 300, 400)
-"""Grasps of the columns of the table of learning while grasping."""
+"""Numbers of grasps in the columns of the table of learning while grasping."""
 
 ROWS = {
     "builtin-10": "10 objects",
     "builtin-30": "30 objects",
     "unseen-concave": "10 arches, never trained on",
 }
-"""Evaluations of the table of success, and their titles."""
+"""Evaluations in the table of success, and their titles."""
 
 RATES = {"gn": "GN, until the table is empty", "gn_first": "GN, first grasp", "random_foreground": "random foreground"}
-"""Rates of success of that table, and their titles."""
+"""Rates of success in that table, and their titles."""
 
 
 def success_table(values: dict[str, Any]) -> str:
-    """Success of the network that comes with the package, with 95 % intervals, and what physics allows."""
+    """Return a table of the shipped network's success, with 95 % intervals, and what physics allows."""
     titles = [*RATES.values(), "tables", "grasps", "tables emptied", "ceiling", "ECE"]
     lines = ["| | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
     for row, title in ROWS.items():
@@ -122,7 +122,7 @@ def success_table(values: dict[str, Any]) -> str:
 
 
 def label_table(values: dict[str, Any]) -> str:
-    """How far the labels of pre-training agree with physics, single objects."""
+    """Return a table of how far the labels of pre-training agree with physics, on single objects."""
     at = "builtin-10/labels_of_single_objects"
     lines = ["| random grasps | agree | positives that hold | negatives that fail |", "| --- | --- | --- | --- |"]
     shares = [f"{100 * values[f'{at}/{key}']:.0f} %" for key in ("agree", "positive_holds", "negative_fails")]
@@ -130,7 +130,7 @@ def label_table(values: dict[str, Any]) -> str:
 
 
 def tables(values: dict[str, Any]) -> list[str]:
-    """All tables of the page."""
+    """Return all tables of the page."""
     return [success_table(values), curves.grasp_table(values, COUNTS), label_table(values)]
 
 
@@ -148,7 +148,7 @@ def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command line and return the exit code."""
     return command.main("grasping", str(__doc__), list_runs, page=write_page, arguments=arguments)
 
 

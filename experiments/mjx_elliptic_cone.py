@@ -1,4 +1,4 @@
-"""The cause in docs/mjx-elliptic-cone.md: a point of the line search costs NaN, and the solver takes a step upwards.
+"""The experiment of docs/mjx-elliptic-cone.md: why MJX's elliptic cones fail in float32.
 
     python -m experiments.mjx_elliptic_cone
 
@@ -21,22 +21,25 @@ from jax import numpy as jnp
 from mujoco import mjx
 from mujoco.mjx._src import solver
 
-BOXES, SCENES, STEPS = 6, 32, 400
-"""Boxes of a pile, piles, and time steps."""
-
+BOXES = 6
+"""Number of boxes in a pile."""
+SCENES = 32
+"""Number of piles."""
+STEPS = 400
+"""Number of time steps."""
 _BODY = '<body><freejoint/><geom type="box" size=".02 .015 .025" density="500"/></body>'
 MJCF = f"""<mujoco><option timestep=".0025" integrator="implicitfast" cone="elliptic" impratio="10" iterations="50"
  ls_iterations="50" jacobian="dense"/><custom><numeric name="max_contact_points" data="60"/></custom>
 <default><geom solref=".01 1" friction=".5 .005 .0001"/></default>
 <worldbody><geom type="plane" size="0 0 1"/>{_BODY * BOXES}</worldbody></mujoco>"""
-"""Plain boxes on a plane."""
+"""A model of plain boxes on a plane."""
 
 ROOTS = {"mjx as it is": jnp.sqrt, "mjx, sqrt(max(x, 0))": lambda x: jnp.sqrt(jnp.maximum(x, 0.0))}
-"""Square roots for the solver."""
+"""Square roots that the solver is run with."""
 
 
 def starts() -> np.ndarray:
-    """Poses of the boxes above the plane: `[SCENES, BOXES, 7]`, metres and unit quaternions."""
+    """Return poses of the boxes above the plane: `[SCENES, BOXES, 7]`, metres and unit quaternions."""
     rng = np.random.default_rng(0)
     start = np.zeros((SCENES, BOXES, 7), np.float32)
     start[..., :2] = rng.uniform(-0.03, 0.03, (SCENES, BOXES, 2))
@@ -47,7 +50,7 @@ def starts() -> np.ndarray:
 
 
 def peaks_mjx(spec: mujoco.MjModel, start: np.ndarray) -> np.ndarray:
-    """Highest speed of a box in each scene, by MJX: `[SCENES]` m/s."""
+    """Return the highest speed of a box in each scene, by MJX: `[SCENES]` m/s."""
     model = mjx.put_model(spec)
 
     def rollout(qpos: jax.Array) -> jax.Array:
@@ -61,7 +64,7 @@ def peaks_mjx(spec: mujoco.MjModel, start: np.ndarray) -> np.ndarray:
 
 
 def peak_c(spec: mujoco.MjModel, qpos: np.ndarray) -> float:
-    """Highest speed of a box in one scene, by MuJoCo C: m/s."""
+    """Return the highest speed of a box in one scene, by MuJoCo C: m/s."""
     data, top = mujoco.MjData(spec), 0.0
     data.qpos[:] = qpos.ravel()
     for _ in range(STEPS):
@@ -71,7 +74,7 @@ def peak_c(spec: mujoco.MjModel, qpos: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the experiment and print its table."""
     spec, start = mujoco.MjModel.from_xml_string(MJCF), starts()
     for name, root in ROOTS.items():
         solver.jp = types.SimpleNamespace(**{**vars(jnp), "sqrt": root})

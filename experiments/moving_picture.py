@@ -36,28 +36,28 @@ from dipn_jax.workspace import GRIPPER, WORKSPACE
 from dipn_jax.world import primitives
 
 SIZE = (7.4, 4.15)
-"""Inches of the picture."""
-DOTS = 100
-"""Pixels an inch."""
+"""Width and height of the picture in inches."""
+DPI = 100
+"""Resolution in pixels per inch."""
 PERIOD = 0.1
 """Simulated seconds between frames."""
-SHOWN = 0.12
+FRAME_SECONDS = 0.12
 """Seconds for which a frame is shown."""
-HOLD = 8
-"""Frames for which a decision is shown before it is carried out, and a result after a push."""
+HOLD_FRAMES = 8
+"""Frames for which a decision is shown before it is executed, and the result after a push."""
 THRESHOLD = 0.7
-"""Score over which `dipn-eval clear` grasps at once unless told otherwise."""
-DARK = "#1b1b1b"
+"""Score above which `dipn-eval clear` grasps at once by default."""
+BACKGROUND = "#1b1b1b"
 """Colour of the background."""
 COLORS = 96
-"""Colours of the GIF's palette."""
+"""Number of colours in the GIF's palette."""
 LIGHT = np.array([-0.5, 0.6, 0.9])
 """Direction to the light that shades slopes; workspace frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """What one picture shows."""
+    """The content of one picture."""
 
     picture: np.ndarray  # [224, 224, 3] the camera's image
     title: str
@@ -69,7 +69,7 @@ class Frame:
 
 
 def shaded(color: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """The colours `[H, W, 3]` of a height map `[H, W]` (metres), lit from one side, with dark edges."""
+    """Return the colours `[H, W, 3]` of a height map `[H, W]` (metres), lit from one side, with dark edges."""
     smooth = cv2.GaussianBlur(height, (3, 3), 0)
     down, across = np.gradient(smooth, WORKSPACE.pixel)
     normal = np.stack([-across, -down, np.ones_like(height)], -1)
@@ -79,18 +79,18 @@ def shaded(color: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 
 def seen(scene: Scene, poses: np.ndarray) -> np.ndarray:
-    """The shaded image `[224, 224, 3]` of a scene `[N]` at poses `[N, 7]`."""
+    """Return the shaded image `[224, 224, 3]` of a scene `[N]` at poses `[N, 7]`."""
     image = render.render(scene, poses)
     return shaded(np.asarray(image.color), np.asarray(image.height))
 
 
 def scene_at(shown: film.Film, step: int) -> Scene:
-    """The scene before action `step` of a film."""
+    """Return the scene before action `step` of a film."""
     return Scene(shown.shape[step], shown.size, shown.color, shown.mass, shown.friction)
 
 
 def trajectory(shown: film.Film, step: int) -> Trajectory:
-    """The gripper's set points `[1, K]` of action `step`."""
+    """Return the gripper's set points `[1, K]` of action `step`."""
     if shown.what[step] == "push":
         push = shown.push[step : step + 1]
         return primitives.push_trajectory(Push(push[:, :2], push[:, 2], push[:, 3]))
@@ -100,7 +100,7 @@ def trajectory(shown: film.Film, step: int) -> Trajectory:
 
 
 def simulated(shown: film.Film, step: int, engine: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Poses `[S, N, 7]` and gripper `[S, 5]` every PERIOD of action `step`."""
+    """Return poses `[S, N, 7]` and gripper `[S, 5]` every PERIOD of action `step`."""
     path = trajectory(shown, step)
     times = np.arange(0.0, float(np.asarray(path.time)[0, -1]), PERIOD)
     scene = structs.stack([scene_at(shown, step)])
@@ -109,7 +109,7 @@ def simulated(shown: film.Film, step: int, engine: Any) -> tuple[np.ndarray, np.
 
 
 def frames(shown: film.Film, engine: Any) -> Iterator[Frame]:
-    """The whole film of T actions."""
+    """Return the whole film of T actions."""
     for step, what in enumerate(shown.what):
         scene, score = scene_at(shown, step), shown.values[step, 0]
         before, push = seen(scene, shown.poses[step]), what == "push"
@@ -117,12 +117,12 @@ def frames(shown: film.Film, engine: Any) -> Iterator[Frame]:
         note = "" if push else "grasp at once:\nno push is imagined" if score > THRESHOLD else "no push promises more"
         about = (said, note, shown.pictures(step)[1] if push else None)
         action = {"push": shown.push[step]} if push else {"grasp": shown.grasp[step]}
-        yield from [Frame(before, *about, **action)] * (HOLD if push else HOLD // 2)
+        yield from [Frame(before, *about, **action)] * (HOLD_FRAMES if push else HOLD_FRAMES // 2)
         for poses, gripper in zip(*simulated(shown, step, engine), strict=True):
             yield Frame(seen(scene, poses), *about, gripper)
         if push:
-            yield from [Frame(seen(scene, shown.poses[step + 1]), *about)] * HOLD
-    yield from [Frame(seen(scene_at(shown, -1), shown.poses[-1]), "cleared")] * HOLD
+            yield from [Frame(seen(scene, shown.poses[step + 1]), *about)] * HOLD_FRAMES
+    yield from [Frame(seen(scene_at(shown, -1), shown.poses[-1]), "cleared")] * HOLD_FRAMES
 
 
 def fingers(axis: Any, gripper: np.ndarray) -> None:
@@ -138,8 +138,8 @@ def fingers(axis: Any, gripper: np.ndarray) -> None:
 
 
 def draw(frame: Frame) -> Image.Image:
-    """One picture."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=SIZE, dpi=DOTS, facecolor=DARK)
+    """Draw one picture."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=SIZE, dpi=DPI, facecolor=BACKGROUND)
     figure.subplots_adjust(0.015, 0.02, 0.985, 0.87, 0.03)
     drawing.show(left, smooth(frame.picture))
     left.set_title(frame.title, color="white", fontsize=10, loc="left")
@@ -162,18 +162,18 @@ def draw(frame: Frame) -> Image.Image:
 
 
 def smooth(picture: np.ndarray) -> np.ndarray:
-    """The picture with twice the pixels, without stairs at its edges."""
+    """Return the picture with twice the pixels and smooth edges."""
     return np.clip(cv2.resize(picture.astype(np.float32), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 0, 1)
 
 
 def save(pictures: list[Image.Image], path: pathlib.Path) -> None:
-    """Write an endless GIF; all pictures share one palette, so that only what changes is stored."""
+    """Write an endless GIF; all pictures share one palette, so that only changed pixels are stored."""
     few = pictures[:: max(1, len(pictures) // 12)]
     sheet = Image.fromarray(np.concatenate([np.asarray(each) for each in few]))
     palette = sheet.quantize(COLORS, dither=Image.Dither.NONE)
     flat = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
     path.parent.mkdir(parents=True, exist_ok=True)
-    flat[0].save(path, save_all=True, append_images=flat[1:], duration=int(1000 * SHOWN), loop=0, optimize=True)
+    flat[0].save(path, save_all=True, append_images=flat[1:], duration=int(1000 * FRAME_SECONDS), loop=0, optimize=True)
 
 
 def main(
@@ -181,12 +181,12 @@ def main(
     to: pathlib.Path = pathlib.Path("docs/clearing.gif"),
     table: int = 0,
 ) -> None:
-    """Draw one table of an evaluation.
+    """Make the moving picture of one table of an evaluation.
 
     Args:
       out: the folder that `dipn-eval clear --out` wrote.
       to: the GIF.
-      table: which of its episodes.
+      table: number of the episode.
     """
     shown = film.load(out / "episodes" / f"{table:03d}.npz")
     pictures = [draw(frame) for frame in frames(shown, make_engine("native"))]

@@ -1,4 +1,4 @@
-"""The pages of results in docs: their tables, and a box with the machines, commits and seeds behind them."""
+"""The pages of results in docs: their tables, and a box with the machines, commits and seeds of their runs."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ from experiments import runs
 from experiments.runs import NOT_RECORDED, Run
 
 DOCS = pathlib.Path(__file__).parent.parent / "docs"
+"""The folder of the pages."""
 
-BOX_BEGINS, BOX_ENDS = "<!-- box: begin -->", "<!-- box: end -->"
-"""Lines of a page between which its box stands."""
-
+BOX_BEGINS = "<!-- box: begin -->"
+"""Line of a page after which its box stands."""
+BOX_ENDS = "<!-- box: end -->"
+"""Line of a page before which its box ends."""
 BOX_WIDTH = 110
-"""Characters of a line of the box."""
+"""Length of a line of the box in characters."""
 
 MADE = "made"
-"""Key of a page's JSON under which `made` stands; all other keys are numbers."""
+"""Key of a page's JSON that holds what `made` returns; all other keys are numbers."""
 
 
 def made(listed: Sequence[Run]) -> dict[str, Any]:
-    """What the stamps of runs say of how they were made, by name of run, as JSON."""
+    """Return what the stamps of runs say about how they were made, by name of run, as JSON."""
     facts = ("made_by", "seed", "versions")
     stamps = {run.name: runs.read_stamp(run) for run in listed}
     return {name: {key: stamp[key] for key in facts if key in stamp} for name, stamp in stamps.items()}
 
 
 def box(values: dict[str, Any]) -> str:
-    """The box of a page, as Markdown: how many figures, and the machines, commits, versions and seeds of its runs.
+    """Return the box of a page as Markdown: number of figures, and machines, commits, versions and seeds of its runs.
 
     Args:
       values: a page's JSON: numbers by name, and under `made`, if they are known, the facts about its runs.
@@ -68,7 +70,7 @@ def _seeds(facts: dict[str, Any]) -> str:
 
 
 def _grouped(by_run: dict[str, str]) -> str:
-    """Each value once, with the runs that have it; the one that most have goes last, without their names."""
+    """Return each value once with the names of its runs; the most frequent value comes last, without names."""
     if not by_run:
         return NOT_RECORDED
     groups: dict[str, list[str]] = {}
@@ -80,7 +82,7 @@ def _grouped(by_run: dict[str, str]) -> str:
 
 
 def with_box(text: str, content: str) -> str:
-    """The page `text` with `content` as its box.
+    """Return the page `text` with `content` as its box.
 
     Raises:
       UserError: the page has no markers for it.
@@ -93,7 +95,7 @@ def with_box(text: str, content: str) -> str:
 
 
 def with_table(text: str, table: str) -> str:
-    """The page `text` with `table` in place of the one that has the same heading.
+    """Return the page `text` with `table` instead of the table with the same heading.
 
     Raises:
       UserError: no table of the page, or more than one, has that heading.
@@ -112,9 +114,9 @@ def write(name: str, values: dict[str, Any], tables: Sequence[str], *, docs: pat
     """Write `NAME.json` and put the tables and the box into `NAME.md`, which must have places for them.
 
     Args:
-      name: of the page.
+      name: name of the page.
       values: its JSON.
-      tables: as Markdown.
+      tables: tables as Markdown.
       docs: folder of the page.
     """
     page = docs / f"{name}.md"

@@ -1,4 +1,4 @@
-"""Push prediction: the learning curves and everything else on docs/push-prediction.md.
+"""Push prediction: the learning curves and all other results on docs/push-prediction.md.
 
     python -m experiments.push_prediction          # or make push-figures
 
@@ -24,13 +24,13 @@ from experiments import command, pages
 from experiments.runs import Recipe, Run
 
 STEPS = {100: 600, 300: 1000, 500: 1500, 1000: 2500, 1500: 3000, 51000: 10000}
-"""Optimizer steps of the learning curve, by number of pushes learnt from."""
+"""Optimizer steps of the learning curve, by number of pushes in the training data."""
 
 TRAIN = "dipn-train push --eval-every 1000 --save-every 1000 --data"
-"""Begins a training; a folder of pushes follows."""
+"""Start of a training command; a folder of pushes follows."""
 
 TRAIN_1500 = "dipn-train push --eval-every 1000 --save-every 1000 --limit 1500 --steps 3000 --data"
-"""Begins a training on 1,500 pushes; a folder of pushes follows."""
+"""Start of a training command on 1,500 pushes; a folder of pushes follows."""
 
 ITEMS = {
     "cuboid": "cuboid_half cuboid_flat cuboid_long cube cuboid_mid cuboid_square",
@@ -43,7 +43,7 @@ ITEMS = {
 
 
 def list_runs(root: pathlib.Path) -> list[Run]:
-    """The runs of the page, which write to `root`/push."""
+    """Return the runs of the page, which write to `root`/push."""
     run = Recipe(root / "push")
 
     # the learning curve: six numbers of pushes, three seeds each
@@ -99,14 +99,14 @@ SHIFTS = {
     "shift-stickier": "friction 0.5 to 0.7",
     "shift-crowded": "8 to 15 objects (1 to 7)",
 }
-"""What is different in the scenes of each such run (and what the network was trained on)."""
+"""Differences of the scenes in each such run (and from what the network was trained on)."""
 
 COLUMNS = [(f"{c}cm", which) for c in curves.DISTANCES for which in ("all", "moved")]
 """Distance and objects of each column of errors."""
 
 
 def shift_table(values: dict[str, Any]) -> str:
-    """The shipped network, the floor and the better baseline in worlds that differ from that of the training data."""
+    """Return a table of the shipped network, the floor and the better baseline in worlds unlike the training data."""
     titles = [f"{at}, {which}" for at, which in COLUMNS]
     lines = ["| scenes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
     for shift, title in SHIFTS.items():
@@ -119,7 +119,7 @@ def shift_table(values: dict[str, Any]) -> str:
 
 
 def alone_table(values: dict[str, Any]) -> str:
-    """One network for every distance, one for each, and one trained on found masks; 1,500 pushes, seed 0."""
+    """Return a table of one network for all distances, one for each, and one trained on found masks; 1,500 pushes."""
     names = {"every": "one network for 1 to 10 cm", "only5": "trained for 5 cm", "only10": "trained for 10 cm"}
     names["found"] = "1 to 10 cm, trained on masks found in the image"
     columns = [(f"push_error{masks}", at, which) for masks in ("", "_segmented") for at, which in COLUMNS]
@@ -135,7 +135,7 @@ def alone_table(values: dict[str, Any]) -> str:
 
 
 def unseen_table(values: dict[str, Any]) -> str:
-    """Scenes of one class of shapes only: a network trained without it, and one with all; 1,500 pushes each."""
+    """Return a table on scenes of one class of shapes: a network trained without the class, and one with all."""
     titles = [f"{at}, {which}" for at, which in COLUMNS]
     lines = ["| shapes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
     predictors = {
@@ -153,7 +153,7 @@ def unseen_table(values: dict[str, Any]) -> str:
 
 
 def crowd_table(values: dict[str, Any]) -> str:
-    """Scenes of 8 to 15 objects: networks trained on such scenes, and on 1 to 7."""
+    """Return a table on scenes of 8 to 15 objects: networks trained on such scenes, and on 1 to 7."""
     titles = [f"{at}, {which}" for at, which in COLUMNS]
     lines = ["| trained on | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
     trained = {
@@ -184,11 +184,11 @@ GOALS = [
         (0.35, 0.40),
     ),
 ]
-"""Of each row: title, key, whether it is divided by the better baseline, and goals at 5 and 10 cm."""
+"""Rows of the table of goals: title, key, whether it is divided by the better baseline, and goals at 5 and 10 cm."""
 
 
 def goal_table(values: dict[str, Any]) -> str:
-    """The goals and what was measured."""
+    """Return a table of the goals and what was measured."""
     lines = ["| figure | 5 cm, goal | 5 cm | 10 cm, goal | 10 cm |", "| --- | --- | --- | --- | --- |"]
     for title, key, over, goals in GOALS:
         cells = []
@@ -200,7 +200,7 @@ def goal_table(values: dict[str, Any]) -> str:
 
 
 def tables(values: dict[str, Any]) -> list[str]:
-    """All tables of the page."""
+    """Return all tables of the page."""
     pages = [curves.push_table(values, which=which) for which in ("all", "moved")]
     return [
         goal_table(values),
@@ -228,7 +228,7 @@ def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+    """Run the command line and return the exit code."""
     return command.main("push_prediction", str(__doc__), list_runs, page=write_page, arguments=arguments)
 
 

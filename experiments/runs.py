@@ -1,4 +1,4 @@
-"""A list of commands that is carried out in order, skips what is complete and can be interrupted at any time."""
+"""Run a list of commands in order, skipping complete ones; it can be interrupted at any time."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ PROGRAMS = {
     "dipn-train": "dipn_jax.train.cli",
     "dipn-eval": "dipn_jax.eval.cli",
 }
-"""Module of each of the project's commands; a run's command may also begin with any other program."""
+"""Module of each of the project's commands; a run's command may also start with any other program."""
 
 STAMP = "stamp.json"
 """File in a run's folder: the command that wrote there, whether it is complete, and with what machines and commits."""
 
 NOT_RECORDED = "not recorded"
-"""What a stamp says of work that was done in its folder before there was a stamp."""
+"""What a stamp says of work done in its folder before there was a stamp."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,15 +42,16 @@ class Run:
 
     @property
     def line(self) -> str:
-        """The command as it is typed in a shell."""
+        """The command as one types it in a shell."""
         return shlex.join(self.command)
 
 
 Part = str | pathlib.Path | Sequence[pathlib.Path]
+"""A part of a command: text to be split at spaces, a path, or several paths."""
 
 
 def words(parts: Iterable[Part]) -> tuple[str, ...]:
-    """The words of a command: texts are split at spaces, paths stay whole."""
+    """Return the words of a command: texts are split at spaces, paths are kept whole."""
     found: list[str] = []
     for part in parts:
         if isinstance(part, str):
@@ -61,7 +62,7 @@ def words(parts: Iterable[Part]) -> tuple[str, ...]:
 
 
 class Recipe:
-    """A list of runs under way: `run = Recipe(folder)`, then one call a command; each returns the folder it writes."""
+    """A list of runs in the making: `run = Recipe(folder)`, then one call per command; each returns its folder."""
 
     def __init__(self, folder: pathlib.Path) -> None:
         self.folder = folder
@@ -80,19 +81,19 @@ class Recipe:
         return place
 
     def borrow(self, others: Sequence[Run], name: str, *, prefix: str) -> pathlib.Path:
-        """Add the run `name` of another recipe, with what it needs, as `prefix/NAME`; returns the folder it writes."""
+        """Add the run `name` of another recipe, with what it needs, as `prefix/NAME`; return the folder it writes."""
         wanted = select(others, [name])
         self.runs += [dataclasses.replace(run, name=f"{prefix}/{run.name}") for run in wanted]
         return wanted[-1].out
 
 
 def needs(run: Run, others: Sequence[Run]) -> list[Run]:
-    """Those of `others` whose folders the command of `run` reads: their names are among its arguments."""
+    """Return those of `others` whose folders the command of `run` reads, that is, has among its arguments."""
     return [other for other in others if other.out != run.out and str(other.out) in run.command]
 
 
 def keys(listed: Sequence[Run]) -> dict[str, str]:
-    """By name of run: a digest of its command and of the commands of all that it needs, in hex."""
+    """Return by name of run a digest, in hex, of its command and of the commands of all runs that it needs."""
     found: dict[str, str] = {}
     for run in listed:
         before = [found[other.name] for other in needs(run, listed)]
@@ -101,7 +102,7 @@ def keys(listed: Sequence[Run]) -> dict[str, str]:
 
 
 def select(listed: Sequence[Run], only: Sequence[str]) -> list[Run]:
-    """The runs called `only`, and before them those that they need; all where `only` is empty.
+    """Return the runs called `only`, and before them those that they need; all where `only` is empty.
 
     Raises:
       UserError: one of the names is none.
@@ -119,19 +120,19 @@ def select(listed: Sequence[Run], only: Sequence[str]) -> list[Run]:
 
 
 def read_stamp(run: Run) -> dict[str, Any]:
-    """The stamp in a run's folder; empty where there is none."""
+    """Return the stamp in a run's folder; empty where there is none."""
     path = run.out / STAMP
     return files.read_json(path) if path.exists() else {}
 
 
 def is_complete(run: Run, key: str) -> bool:
-    """Whether this very command, with what it needs, has ended well."""
+    """Return whether this command, with what it needs, has ended well."""
     stamp = read_stamp(run)
     return stamp.get("key") == key and stamp.get("complete") is True
 
 
 def write_stamp(run: Run, key: str, *, complete: bool) -> None:
-    """Stamp a run's folder; machines and commits that have worked there before stay listed."""
+    """Stamp a run's folder; machines and commits that worked there before stay listed."""
     here = {"commit": machine.commit(), "processor": machine.processor(), "cores": machine.cores()}
     made = read_stamp(run).get("made_by", [_before()] if _has_files(run.out) else [])
     stamp = {
@@ -154,7 +155,7 @@ def _has_files(folder: pathlib.Path) -> bool:
 
 
 def _seed(out: pathlib.Path) -> int | None:
-    """The seed that a data set, a training or an evaluation says it has; None where it has none."""
+    """Return the seed that a data set, a training or an evaluation was made with; None where it has none."""
     for path in (out / "config.json", out / "settings.json"):
         if path.exists() and "seed" in (found := files.read_json(path)):
             return int(found["seed"])
@@ -187,7 +188,7 @@ def carry_out(chosen: Sequence[Run], found: dict[str, str]) -> int:
 
 
 def _call(run: Run) -> int:
-    """Exit code of a run's command.
+    """Run a command and return its exit code.
 
     The command is in a process group of its own: an interruption reaches us alone and is passed on once, so that the
     command can save its state.
@@ -212,7 +213,7 @@ def _call(run: Run) -> int:
 
 
 def parse(run: Run) -> dict[str, Any]:
-    """The arguments of a run's command as its own parser reads them; nothing is carried out.
+    """Return the arguments of a run's command as its own parser reads them, without running it.
 
     Raises:
       UserError: it would not take them. (The parser has printed why.)

@@ -1,4 +1,4 @@
-"""Shared by all tests: compiled functions and small data made once a session."""
+"""Fixtures of all tests: compiled functions and small data sets, made once per session."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ SLOTS = 5
 
 @pytest.fixture(scope="session")
 def engine() -> Any:
-    """MuJoCo C."""
+    """Return the engine of MuJoCo C."""
     return make_engine("native")
 
 
 @pytest.fixture(scope="session")
 def settled(engine: Any) -> Any:
-    """Six scenes of five objects at rest, numpy."""
+    """Return six scenes of five objects at rest, as NumPy arrays."""
     return clutter.settled_scenes(jax.random.key(7), engine, scenes.fixed_count(SLOTS), 6)
 
 
@@ -53,7 +53,7 @@ def _job(kind: str, episodes: int, actions: int) -> Job:
 
 @pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
-    """A tiny data set of each kind."""
+    """Make a tiny data set of each kind."""
     root = tmp_path_factory.mktemp("data")
     for kind, episodes, actions in (("push", 24, 4), ("grasp", 24, 4), ("images", 4, 1)):
         generate(_job(kind, episodes, actions), root / kind)
@@ -62,5 +62,5 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """A seeded generator."""
+    """Return a seeded generator."""
     return np.random.default_rng(0)

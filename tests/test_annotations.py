@@ -1,4 +1,4 @@
-"""Shapes in annotations: all of them mean something, tests check them at run time, and nothing else does."""
+"""Shapes in annotations: all of them can be evaluated and are checked in tests, and only there."""
 
 import importlib
 import inspect
@@ -56,7 +56,7 @@ def test_jax_may_rebuild_structs_around_anything() -> None:
 
 
 def _annotated() -> Iterator[tuple[str, Any]]:
-    """Everything of the package that has annotations."""
+    """Return everything in the package that has annotations."""
     for info in pkgutil.walk_packages(dipn_jax.__path__, "dipn_jax."):
         module = importlib.import_module(info.name)
         for name, item in vars(module).items():
@@ -69,7 +69,7 @@ def _annotated() -> Iterator[tuple[str, Any]]:
 
 
 def test_every_annotation_can_be_evaluated() -> None:
-    """What cannot is not checked, silently. The commands name types that they import where they run: no shapes."""
+    """One that cannot is silently not checked. Commands name types that they import late: no shapes."""
     found = list(_annotated())
     assert len(found) > 500
     for name, item in found:

@@ -1,4 +1,4 @@
-"""The benchmarks' command line; and the page in docs shows the figures in docs. What they measure is not tested."""
+"""The benchmarks' command line, and the page of figures in docs. What the benchmarks measure is not tested."""
 
 import json
 import pathlib

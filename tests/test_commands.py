@@ -134,7 +134,7 @@ def _help(stage: str, *command: str, capfd: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.mark.parametrize("stage", COMMANDS)
-def test_help_teaches(stage: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_examples(stage: str, capfd: pytest.CaptureFixture[str]) -> None:
     for name, command in COMMANDS[stage].items():
         text = _help(stage, name, capfd=capfd)
         assert len(text) > 300 or name in ("verify", "repair", "info")
@@ -169,7 +169,7 @@ def test_help_imports_nothing_that_is_slow(stage: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_reader_that_has_seen_enough_is_no_mistake() -> None:
+def test_a_closed_pipe_is_not_an_error() -> None:
     ours, theirs = os.pipe()
     os.close(ours)
     done = subprocess.run(

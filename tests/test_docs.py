@@ -1,4 +1,4 @@
-"""The pages that people read: links lead somewhere, commands exist, Python runs, figures are those that are kept."""
+"""The pages that people read: links lead somewhere, commands exist, Python runs, figures are those of the JSON."""
 
 import contextlib
 import functools
@@ -28,25 +28,25 @@ SMALL = {
     "--episodes": "24", "--steps": "2", "--objects": "1:3", "--candidates": "4", "--distances": "0.05:0.1:0.05",
     "--scenes": "2", "--instances": "1",
 }  # fmt: skip
-"""Options that make a command of the tutorial as big as it is -> what a test gives instead."""
+"""Options that make a command of the tutorial large, and the smaller ones of the test."""
 ALWAYS = {
     "dipn-datagen": ["--objects", "1:3", "--shard-size", "24"],
     "dipn-train": ["--steps", "2", "--batch", "4", "--eval-every", "2", "--save-every", "2"],
     "dipn-eval": [],
 }
-"""Options that a test adds to those commands where they make or learn something."""
+"""Options that the test adds to commands of the tutorial that make data or train."""
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
 def commands(page: pathlib.Path) -> list[list[str]]:
-    """The words of every shell command on a page, without `.venv/bin/` and comments."""
+    """Return the words of every shell command on a page, without `.venv/bin/` and comments."""
     lines = "\n".join(block[1] for block in SHELL.finditer(page.read_text())).replace("\\\n", " ").splitlines()
     return [[word.removeprefix(BIN) for word in shlex.split(line, comments=True)] for line in lines if line.strip()]
 
 
 def parsed(words: list[str]) -> bool:
-    """Whether a command's own parser takes its words; nothing is carried out."""
+    """Check that a command's own parser accepts its words, without running the command."""
     program, *arguments = words
     called: list[str] = []
 
@@ -83,7 +83,7 @@ def test_files_of_this_project_that_a_page_names_exist(page: pathlib.Path) -> No
 
 
 @each_page
-def test_commands_are_ones_that_exist(page: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_commands_on_pages_exist(page: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
     makefile = (ROOT / "Makefile").read_text()
     for words in commands(page):
         match words:
@@ -130,7 +130,7 @@ def test_the_licence_and_the_citation_are_there() -> None:
 
 
 def prepare(folder: pathlib.Path, data: dict[str, pathlib.Path]) -> None:
-    """What the pages' Python reads: a data set, runs (the shipped networks), a case file."""
+    """Make what the pages' Python reads: a data set, runs (the shipped networks), a case file."""
     shutil.copytree(data["push"], folder / "data" / "push")
     for run, network in (("dipn", "dipn"), ("gn", "grasp")):
         shutil.copytree(ROOT / "dipn_jax" / "data" / network, folder / "runs" / run)
@@ -170,7 +170,7 @@ def test_the_tutorial_clears_its_table(tmp_path: pathlib.Path) -> None:
 
 
 def smaller(words: list[str]) -> tuple[str, ...]:
-    """A command of the tutorial, made small."""
+    """Return a command of the tutorial with smaller numbers."""
     program, name, *rest = words
     options = [SMALL.get(before, word) for before, word in zip(["", *rest], rest, strict=False)]
     extra = ALWAYS[program] if name != "images" else ["--shard-size", "24"]

@@ -1,4 +1,4 @@
-"""Every example runs, and shows what it says: its variables are held against what is known."""
+"""Every example runs and shows what it says: its variables are compared with known values."""
 
 import pathlib
 import runpy
@@ -11,7 +11,7 @@ EXAMPLES = pathlib.Path(__file__).parent.parent / "examples"
 
 
 def run(name: str) -> dict[str, Any]:
-    """The variables of an example after it has run."""
+    """Run an example and return its variables."""
     (path,) = EXAMPLES.glob(f"{name}_*.py")
     return runpy.run_path(str(path))
 

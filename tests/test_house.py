@@ -1,4 +1,4 @@
-"""The house itself: layers, conventions, packaging."""
+"""The structure of the project: layers, conventions, packaging."""
 
 import ast
 import importlib
@@ -19,9 +19,9 @@ ROOT = pathlib.Path(__file__).parent.parent
 STAGES = ("datagen", "train", "eval")
 PACKAGES = ("dipn_jax", *STAGES)
 TOPS = ("benchmarks", "experiments")
-"""What stands on top of everything else, and is not in the wheel."""
+"""Packages that may import everything, are imported by nothing, and are not in the wheel."""
 MOST_LINES = 300
-"""Of a file."""
+"""Largest number of lines in a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
     "errors", "names", "files", "machine", "structs", "workspace", "geometry", "batching", "engine",
@@ -30,7 +30,7 @@ ORDER = [
 
 
 def _imports(path: pathlib.Path) -> set[str]:
-    """Full names of what a file imports: of `from a import b` both `a` and `a.b`; relative ones from `dipn_jax` on."""
+    """Return full names of what a file imports: of `from a import b` both `a` and `a.b`, relative ones resolved."""
     package = [*_package(path)]
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -44,7 +44,7 @@ def _imports(path: pathlib.Path) -> set[str]:
 
 
 def _package(path: pathlib.Path) -> tuple[str, ...]:
-    """The package that a file is in, as it is imported."""
+    """Return the name of the package that a file is in, as it is imported."""
     parts = path.relative_to(ROOT).parent.parts
     return parts if parts[0] == "dipn_jax" else ("dipn_jax", *parts)
 
@@ -155,7 +155,7 @@ def test_no_file_is_longer_than_300_lines() -> None:
 
 
 def test_every_folder_of_tests_mirrors_a_package() -> None:
-    """Each test is in the folder of what it tests; folders of tests have no `__init__.py`, which would shadow ours."""
+    """Each test is in the folder that mirrors its subject; no `__init__.py` there, which would shadow ours."""
     tests = ROOT / "tests"
     assert not list(tests.rglob("__init__.py"))
     folders = {path.parent.relative_to(tests) for path in tests.rglob("test_*.py")} - {pathlib.Path()}
@@ -167,7 +167,7 @@ def test_every_folder_of_tests_mirrors_a_package() -> None:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """Our wheel, built from the sources alone."""
+    """Build our wheel from the sources alone."""
     out = tmp_path_factory.mktemp("wheel")
     source = out / "source"  # nothing that an earlier build left behind
     source.mkdir()
@@ -186,7 +186,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """The scripts' folder of a fresh environment in which our wheel is installed; it borrows the dependencies."""
+    """Install our wheel in a fresh environment that borrows the dependencies; return the folder of its scripts."""
     home = tmp_path_factory.mktemp("environment")
     venv.create(home, with_pip=False)
     python = home / "bin" / "python"
@@ -199,7 +199,7 @@ def installed(wheel: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def _run(program: pathlib.Path, *arguments: str, path: pathlib.Path | None = None) -> str:
-    """Standard output of a program outside of the checkout, with `path` on PYTHONPATH."""
+    """Run a program outside the checkout with `path` on PYTHONPATH; return its standard output."""
     environment = {"PATH": "", "HOME": str(program.parent), **({"PYTHONPATH": str(path)} if path else {})}
     command = [str(program), *arguments]
     return subprocess.run(
@@ -225,7 +225,7 @@ def test_the_wheel_holds_one_package_with_its_data(wheel: pathlib.Path, installe
 
 @pytest.mark.slow
 def test_a_users_own_packages_and_our_commands_do_not_meet(installed: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    """Somebody's own packages `train`, `eval` and `datagen` on PYTHONPATH: ours work, and theirs are theirs."""
+    """With somebody's packages `train`, `eval` and `datagen` on PYTHONPATH, theirs and ours both work."""
     for stage in STAGES:
         (tmp_path / stage).mkdir()
         (tmp_path / stage / "__init__.py").write_text("WHOSE = 'theirs'\n")

@@ -1,4 +1,4 @@
-"""The public names: what `import dipn_jax` offers, and what it does not do."""
+"""The public names: what `import dipn_jax` offers, and that it does nothing else."""
 
 import importlib
 import inspect
@@ -88,7 +88,7 @@ def test_structs_are_indexed_by_row(settled: Any) -> None:
 
 
 def test_a_policy_is_loaded_by_its_name(settled: Any) -> None:
-    """The best grasp of the shipped network on a table, by `gn` and by `dipn+gn` where that does not push."""
+    """`gn` chooses the best grasp of the shipped network, and so does `dipn+gn` where it does not push."""
     observation = dipn_jax.render(settled.scene[0], settled.poses[0])
     grasping = dipn_jax.load_policy("gn")(jax.random.key(0), observation)
     both = dipn_jax.load_policy("dipn+gn")(jax.random.key(0), observation)
@@ -96,7 +96,7 @@ def test_a_policy_is_loaded_by_its_name(settled: Any) -> None:
     np.testing.assert_array_equal(grasping.grasp_pixel, both.grasp_pixel)
     _, row, col = grasping.grasp_pixel
     assert observation.label[row, col] >= 0, "it grasps an object"
-    with pytest.raises(dipn_jax.UserError, match="--method vpg: wants --value-net"):
+    with pytest.raises(dipn_jax.UserError, match="--method vpg: needs --value-net"):
         dipn_jax.load_policy("vpg")
     with pytest.raises(dipn_jax.UserError, match=r"physics.gn: decides on the simulator's state"):
         dipn_jax.load_policy("physics+gn")

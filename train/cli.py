@@ -1,4 +1,4 @@
-"""`dipn-train`: push, grasp-pretrain, grasp, grasp-online, baseline, export."""
+"""The program `dipn-train`: push, grasp-pretrain, grasp, grasp-online, baseline, export."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def push(
     masks: Literal["true", "found"] = "true",
     config: TrainConfig = PUSH,
 ) -> None:
-    r"""DIPN, from push episodes; one network for every push distance.
+    """Train DIPN on push episodes; one network for every push distance.
 
     About four minutes on two cores:
       dipn-train push --data data/push --out runs/dipn
@@ -64,7 +64,7 @@ def push(
       preset: architecture.
       limit: learn from this many of the first episodes only; what is held out stays the same.
       centimetres: push distances learnt.
-      without: leave out scenes with an object of these classes, to see how well they are guessed.
+      without: leave out scenes with an object of these classes, to see how well unseen shapes are predicted.
       masks: true: the simulator's; found: cut out of the rendered image by colour and height.
       config: optimizer and schedule.
     """
@@ -80,7 +80,7 @@ def push(
 def grasp_pretrain(
     data: pathlib.Path, out: pathlib.Path, preset: Preset = "compact", config: TrainConfig = GRASP_PRETRAIN
 ) -> None:
-    """GN on images alone: a pixel is positive where the fingers fit around something.
+    """Train GN on images alone: a pixel is positive where the fingers fit around something.
 
     About a minute on two cores:
       dipn-train grasp-pretrain --data data/images --out runs/gn-pretrained
@@ -105,7 +105,7 @@ def grasp(
     preset: Preset = "compact",
     config: TrainConfig = GRASP,
 ) -> None:
-    """GN on the outcomes of executed grasps, loss at the executed pixel only.
+    """Train GN on the outcomes of executed grasps; the loss is at the executed pixel only.
 
     About three minutes on two cores:
       dipn-train grasp --data data/grasp --init runs/gn-pretrained --out runs/gn
@@ -134,17 +134,17 @@ def grasp_online(
     engine: EngineName = "auto",
     config: OnlineConfig = GRASP_ONLINE,
 ) -> None:
-    """GN learns while it grasps: the best grasp on each of several tables, then some steps on all outcomes so far.
+    """Train GN while it grasps: the best grasp on each of several tables, then some steps on all outcomes so far.
 
     Two minutes on two cores:
       dipn-train grasp-online --init runs/gn-pretrained --out runs/gn-online
 
     Args:
       out: run folder; the same command continues where it stopped.
-      init: run to start from (grasp-pretrain's); without it the compact network knows nothing.
+      init: run to start from (grasp-pretrain's); without it the compact network begins with random weights.
       objects: number of objects on a fresh table: 10, or 1:7.
-      engine: physics.
-      config: how much, and how.
+      engine: physics engine.
+      config: amount and schedule of learning.
     """
     console.require_positive(grasps=config.grasps)
     _check(out, config)
@@ -172,7 +172,7 @@ def baseline(
     engine: EngineName = "auto",
     config: BaselineConfig = BASELINE,
 ) -> None:
-    """A compared method learns while it acts: VPG, the grasps of its reactive form (REA), or DQN's pushes beside GN.
+    """Train a compared method while it acts: VPG, the grasps of its reactive form (REA), or DQN's pushes beside GN.
 
     With the samples that the paper gives them, 10 to 25 minutes each on two cores:
       dipn-train baseline --method vpg --actions 2500 --out runs/vpg
@@ -183,8 +183,8 @@ def baseline(
       out: run folder; the same command continues where it stopped.
       grasp_net: run of dipn-train grasp or grasp-online, or builtin, whose grasps dqn takes.
       objects: number of objects on a fresh table: 10, or 1:7.
-      engine: physics.
-      config: method, how much, and how.
+      engine: physics engine.
+      config: method, and amount and schedule of learning.
     """
     console.require_positive(actions=config.actions)
     _check(out, config)
@@ -208,7 +208,7 @@ def baseline(
 
 
 def _check(out: pathlib.Path, config: OnlineConfig | BaselineConfig) -> None:
-    """Refuse options of learning while acting that make no sense, and an `out` that cannot be a folder."""
+    """Raise a UserError for options of learning while acting that make no sense, or an unusable `out`."""
     console.require_positive(tables=config.tables, updates=config.updates, batch=config.batch)
     console.require_positive(learning_rate=config.learning_rate)
     console.require_between(0, 1, weight_decay=config.weight_decay)
@@ -221,14 +221,14 @@ def export(
     out: pathlib.Path,
     network: Literal["dipn", "grasp"] = "dipn",
 ) -> None:
-    """The weights of a run alone, a quarter of its size: a run that can be given to others, not gone on with.
+    """Export the weights of a run, a quarter of its size: a run to give to others, whose training cannot be continued.
 
       dipn-train export --run runs/dipn --out dipn_jax/data/dipn
 
     Args:
       run: run folder.
       out: new run folder.
-      network: what is in it.
+      network: the kind of network in it.
     """
     from dipn_jax.storage import checkpoint
 
@@ -245,10 +245,11 @@ COMMANDS = {
     "baseline": baseline,
     "export": export,
 }
+"""The commands of `dipn-train`, by name."""
 
 
 def main() -> None:
-    """Entry point."""
+    """Run `dipn-train` and exit with its exit code."""
     sys.exit(console.run("Train the push and grasp networks; every run can be interrupted and resumed.", COMMANDS))
 
 

@@ -1,4 +1,4 @@
-"""How networks are trained: options of `dipn-train`, so importing this imports no JAX."""
+"""How networks are trained, options of `dipn-train`. Importing this imports no JAX."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import tyro
 Preset = Literal["compact", "paper"]
 """Architecture of a network: ours, or as published."""
 ShapeClass = Literal["cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave"]
-"""Classes of `shapes.CLASSES`."""
+"""A class of shapes, as in `shapes.CLASSES`."""
 MethodName = Literal["vpg", "rea", "dqn"]
-"""Compared methods that learn while they act."""
+"""A compared method that learns while it acts."""
 
 
 @dataclasses.dataclass(frozen=True)

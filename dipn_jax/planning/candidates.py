@@ -33,7 +33,7 @@ SAME_GRASP_PIXELS = 10.0
 SAME_GRASP_ROTATIONS = 1
 """Largest difference in rotations (of 16) between two grasps that count as the same grasp."""
 
-_OVERSAMPLE = 4
+_OVERSAMPLE = 4  # pixels of contours drawn for each push
 
 
 @functools.partial(jax.jit, static_argnames="count")
@@ -185,7 +185,7 @@ def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) ->
     """Halve scores `[16, H, W]` near grasps that missed, once for each of them.
 
     Args:
-      scores: of grasps, now.
+      scores: scores of grasps, now.
       missed: `[M, 3]` int32 (rotation, row, col) of grasps that missed on what is there now; -1: none.
     """
     missed = jnp.asarray(missed)

@@ -73,7 +73,7 @@ class PolicyConfig:
     gamma: float = 0.9
     grasp_above: float = 0.7
     released: bool = False  # with the clauses of DIPN's released code
-    cautious: bool = True  # GN's scores are the least of four answers; False: GN as published
+    cautious: bool = True  # GN's scores are the lowest of four mirrored ones; False: GN as published
 
     def rule(self) -> Rule:
         """Return the rule that the planner compares by."""
@@ -119,7 +119,7 @@ class Networks:
             if getattr(self, role) is None:
                 builtin = "" if role == "value" else ", or builtin"
                 raise UserError(
-                    f"--method {method}: wants --{role}-net; give a run of dipn-train {ROLES[role][1]}{builtin}"
+                    f"--method {method}: needs --{role}-net; give a run of dipn-train {ROLES[role][1]}{builtin}"
                 )
         return {role: checkpoint.find(getattr(self, role), network=ROLES[role][0]) for role in needed}
 
@@ -174,7 +174,7 @@ def grasping_policy(scorer: Scorer) -> Policy:
 
 
 def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSummary | None) -> Act:
-    """Build the policy of Alg. 2: imagine the image after every candidate push."""
+    """Return the function that decides by Alg. 2: it imagines the image after every candidate push."""
 
     def act(key: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
         count = len(distances)
@@ -186,12 +186,12 @@ def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSumm
 
 
 def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Act:
-    """Build the policy that compares the best push and the best grasp by value; all pushes go the first distance.
+    """Return the function that compares the best push and the best grasp by value; pushes go the first distance.
 
     Args:
       push_scorer: values of pushes.
       scorer: values of grasps.
-      grasp_at_once: whether the rule's `grasp_above` holds.
+      grasp_at_once: whether to grasp at once above the rule's `grasp_above`.
     """
 
     def act(_: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
@@ -206,7 +206,7 @@ def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Ac
 def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSummary]:
     """Return the scorer that GN's grasps are chosen by, and the summary that images are compared by.
 
-    The clauses of the released code look at the highest score on every image, which only whole images tell.
+    The clauses of the released code need the highest score of every image, so images are then scored whole.
     """
     return scorers.load_scorer(run, cautious=config.cautious), scorers.load_summary(run, whole=config.released)
 
@@ -246,7 +246,7 @@ def _chances(run: pathlib.Path) -> Scorer:
     model: Any = checkpoint.load_network(run, network="vpg")
     if model.config.answers != "chance":
         raise UserError(
-            f"--value-net {run}: has learnt values, not chances; give a run of dipn-train baseline --method rea"
+            f"--value-net {run}: predicts values, not chances; give a run of dipn-train baseline --method rea"
         )
     return _part(run, "grasp")
 
@@ -260,7 +260,7 @@ def _part(run: pathlib.Path, name: str) -> Scorer:
     found = scorers.load_values(run)[vpg.PARTS.index(name)]
     if found is None:
         raise UserError(
-            f"--value-net {run}: has not learnt to {name}; give a run of another dipn-train baseline --method"
+            f"--value-net {run}: was not trained to {name}; give a run of another dipn-train baseline --method"
         )
     return found
 

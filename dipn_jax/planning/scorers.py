@@ -33,9 +33,7 @@ def _scorer(model: nnx.Module, score: Callable[[Any, jax.Array], jax.Array]) -> 
 
 
 def cautious_scorer(model: grasp.GraspNet) -> Scorer:
-    """Return GN as a scorer to choose by: `grasp.cautious_scores` of `compact`, plain scores of the published
-    network.
-    """
+    """Return GN as a scorer to choose by: `grasp.cautious_scores` of `compact`, plain scores of `paper`."""
     return _scorer(model, grasp.cautious_scores if model.config.preset == "compact" else grasp.score_image)
 
 
@@ -45,8 +43,7 @@ def plain_scorer(model: grasp.GraspNet) -> Scorer:
 
 
 def grasp_summary(model: grasp.GraspNet) -> ScoreSummary:
-    """Return the function that summarizes scores of imagined images by mean and highest, the fast way where there is
-    one.
+    """Return the function that summarizes scores of imagined images, the fast way where there is one.
 
     `compact` networks on a CPU score only what moved; elsewhere images are scored whole. The highest score of the fast
     way is not that of the image.

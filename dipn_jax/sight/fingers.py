@@ -36,9 +36,7 @@ HIDDEN_HEIGHT = 1.0
 
 
 def grasp_height(local_height: Float[Array, "*b"] | float) -> Float[jax.Array, "*b"]:
-    """Return the height of the fingertips for a surface `local_height` metres above the table. Source: DIPN's
-    released code.
-    """
+    """Return the fingertips' height for a surface `local_height` metres high. Source: DIPN's released code."""
     return jnp.maximum(jnp.asarray(local_height) - 0.04, 0.02)
 
 
@@ -47,7 +45,7 @@ def under_fingers(
 ) -> Float[jax.Array, "*b"]:
     """Return the highest point, in metres, that the open fingers of each grasp come down on.
 
-    What reaches the border of the map is taken to go on beyond it.
+    An object that reaches the border of the map is assumed to extend beyond it.
 
     Args:
       height: metres.

@@ -58,9 +58,7 @@ def imagine(observation: Observation, centers: Float[Array, "N 2"], motion: Floa
 def move_toward(
     label: Int[Array, "H W"], start: Float[Array, " 2"], angle: Float[Array, ""] | float
 ) -> Int[jax.Array, ""]:
-    """Return the object that the middle of a push from `start` (metres) along `angle` (radians) meets first, or
-    ABSENT.
-    """
+    """Return the object that the middle of a push from `start` (metres) along `angle` meets first, or ABSENT."""
     steps = jnp.arange(0.0, 0.2, WORKSPACE.pixel / 2)
     path = start + steps[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     met = geometry.sample_nearest(label, geometry.metres_to_pixels(path), ABSENT)

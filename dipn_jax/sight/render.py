@@ -19,13 +19,11 @@ from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
 WINDOW = 64
-"""Side in pixels of the window that an object is drawn in: at 2 mm a pixel it holds a diagonal of
-`shapes.MAX_DIAGONAL`.
-"""
+"""Pixels a side of the window that an object is drawn in; at 2 mm a pixel `shapes.MAX_DIAGONAL` fits."""
 TABLE_COLOR = (0.2, 0.2, 0.2)
 """RGB of the table."""
 _STEEP = 1e-6  # |n_z| below which a face is taken as vertical
-_FAR = 1e3
+_FAR = 1e3  # metres: minus this is the top of what is not there
 
 
 def _bounds(

@@ -16,9 +16,9 @@ SAME_COLOR = 22
 """Levels of 255 by which each channel of one object may differ from its median; palettes differ by more."""
 SMALLEST = 30
 """Size in pixels (120 mm^2) below which a region is a fragment of its neighbour."""
-_GAP = 40  # pixels over which a hidden part is bridged: the widest object above
-_REACH = 4  # pixels over which a fragment goes to a neighbour
-_MOST_REGIONS = 200
+_BRIDGED_PIXELS = 40  # pixels over which a hidden part is bridged: the widest object above
+_FRAGMENT_PIXELS = 4  # pixels over which a fragment goes to a neighbour
+_MOST_REGIONS = 200  # regions of one image, after which the rest is left to _fill
 
 
 def segment(height: Real[Array, "*_"], color: Real[Array, "*_"], *, slots: int) -> Int[np.ndarray, "224 224"]:
@@ -64,9 +64,7 @@ def _off_table(image: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 
 def _regions(image: np.ndarray, foreground: np.ndarray) -> np.ndarray:
-    """Label connected areas of one colour `[H, W]` with 1, 2, ...; 0 elsewhere. Each grows from the middle of what
-    is left.
-    """
+    """Label connected areas of one colour with 1, 2, ..., each grown from the middle of what is left; 0 elsewhere."""
     regions = np.zeros(foreground.shape, np.int32)
     left = foreground.astype(np.uint8)
     for number in range(1, _MOST_REGIONS):
@@ -97,16 +95,14 @@ def _join(regions: np.ndarray, image: np.ndarray, height: np.ndarray) -> np.ndar
 
 
 def _bridged(first: np.ndarray, second: np.ndarray, height: np.ndarray) -> bool:
-    """Return whether the shortest line between two masks is short and passes under something higher than both of
-    them.
-    """
+    """Return whether the shortest line between two masks is short and passes under something higher than both."""
     if not first.any() or not second.any():
         return False
     far, nearest = cv2.distanceTransformWithLabels(
         (~first).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
     row, col = np.unravel_index(int(np.where(second, far, np.inf).argmin()), far.shape)
-    if far[row, col] > _GAP:
+    if far[row, col] > _BRIDGED_PIXELS:
         return False
     rows, cols = np.nonzero(first & (nearest == nearest[row, col]))
     t = np.linspace(0, 1, int(far[row, col]) + 2)[1:-1]
@@ -122,7 +118,7 @@ def _fill(regions: np.ndarray, foreground: np.ndarray, slots: int) -> np.ndarray
     )
     owner = np.zeros(int(nearest.max()) + 1, np.int32)
     owner[nearest[regions > 0]] = regions[regions > 0]
-    full = np.where(foreground & (far <= _REACH), owner[nearest], 0)
+    full = np.where(foreground & (far <= _FRAGMENT_PIXELS), owner[nearest], 0)
     numbers, sizes = np.unique(full[full > 0], return_counts=True)
     order = numbers[np.argsort(-sizes, kind="stable")][:slots]
     label = np.full(full.max() + 1, ABSENT, np.int32)

@@ -64,7 +64,7 @@ def load_cases(
         raise UserError(f"case file {path}: a case has {most} objects, but there are {n} slots")
     names = [str(case.get("name", i)) for i, case in enumerate(cases)]
     if len(set(names)) < len(names):
-        raise UserError(f"case file {path}: two cases of one name; give each its own")
+        raise UserError(f"case file {path}: two cases have the same name; give each its own")
     loaded = [_case(case, n, path) for case in cases]
     scene = jax.tree.map(lambda *leaves: np.stack(leaves), *[scene for scene, _ in loaded])
     return names, scene, np.stack([p for _, p in loaded])

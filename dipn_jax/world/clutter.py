@@ -25,7 +25,7 @@ def settled(
 
     Args:
       key: random key.
-      engine: physics.
+      engine: physics engine.
       config: distributions.
       count: scenes dropped.
 
@@ -73,9 +73,9 @@ def grasp_away(
     """Execute one grasp per scene, remove what is held, and let the rest come to rest.
 
     Args:
-      engine: physics.
+      engine: physics engine.
       scene: B scenes.
-      poses: of their objects, before.
+      poses: poses of their objects, before.
       grasps: one a scene.
 
     Returns:

@@ -18,9 +18,7 @@ from dipn_jax.world import shapes
 MARK = "dipn_jax"
 """Name of a custom number in our MJCF that marks a model as ours (`physics.patches` looks for it)."""
 GRIPPER_DOF = 6
-"""Degrees of freedom of the gripper: x, y, z, yaw, left finger, right finger. Each object follows with 7 qpos, 6
-qvel.
-"""
+"""Degrees of freedom of the gripper: x, y, z, yaw, two fingers. Each object follows with 7 qpos and 6 qvel."""
 OBJECT_FRICTION_RATIO = 0.5 / 0.35
 """Friction between objects over that between object and table. Source: DIPN's released code."""
 
@@ -102,8 +100,7 @@ def inertias(scene: Scene) -> Float[np.ndarray, "*b N 3"]:
 
 
 def _fillers(scene: Scene) -> str:
-    """Return meshes that no geom uses, so that the bounding volumes of all meshes have the same number of nodes in
-    every scene.
+    """Return meshes that no geom uses, so that the bounding volumes of all scenes' meshes have as many nodes.
 
     f triangles have 2 f - 1 nodes: a prism of n sides, with f = 4 n - 4, and a double pyramid, with f = 2 n.
     """
@@ -148,7 +145,7 @@ def mjcf(
       config: solver settings.
       gripper: dimensions and gains.
       generic: placeholder geometry in every part (see the module's docstring).
-      alike: add meshes that nothing uses, so that models of all scenes with as many slots are laid out alike.
+      alike: add meshes that nothing uses, so that all scenes with the same number of slots have models of one layout.
 
     Returns:
       XML text. qpos is `[x, y, z, yaw, left, right, (position, quaternion) of every slot]`.

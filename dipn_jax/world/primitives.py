@@ -17,19 +17,35 @@ from dipn_jax.engine import Engine
 from dipn_jax.structs import Array, Fault, Grasp, Outcome, Push, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS
 
-CLEAR = 0.30  # metres: height at which the gripper touches nothing
-SETTLE_TIME = 2.5  # seconds; measured: 7 objects 1.4, 10 objects 1.8, 30 objects 2.1 (p90)
-FENCE_TIME = 1.5  # of a drop; measured: without it 20 % of drops of 10 objects leave one outside, of 30 all
-RESETTLE_TIME = 0.6  # after an action
-DESCEND_TIME = 0.4  # of a push, whose start is free
-REACH_TIME = 0.8  # of a grasp; measured: at 0.45 m/s, in half the time, fingers knock objects aside, some off the table
-PUSH_SPEED = 0.1  # m/s
-CLOSE_SPEED = 0.15  # m/s, each finger; a step instead of a ramp throws objects
+CLEAR_HEIGHT = 0.30
+"""Height in metres at which the gripper touches nothing."""
+SETTLE_TIME = 2.5
+"""Seconds that objects get to come to rest. Measured: 7 objects need 1.4, 10 need 1.8, 30 need 2.1 (p90)."""
+FENCE_TIME = 1.5
+"""Seconds of a drop during which a fence keeps objects in.
+
+Measured: without it an object leaves the workspace in 20 % of drops of 10 objects, and in all of 30.
+"""
+RESETTLE_TIME = 0.6
+"""Seconds that objects get to come to rest after an action."""
+DESCEND_TIME = 0.4
+"""Seconds in which the gripper comes down for a push, whose start is free."""
+REACH_TIME = 0.8
+"""Seconds in which it comes down for a grasp. Measured: in half of that, at 0.45 m/s, fingers knock objects aside."""
+PUSH_SPEED = 0.1
+"""Speed of a push in m/s."""
+CLOSE_SPEED = 0.15
+"""Speed of each finger as it closes, m/s; a step instead of a ramp throws objects."""
 HOLD_TIME = 0.15
+"""Seconds for which the closed fingers wait before the lift."""
 LIFT_TIME = 0.5
+"""Seconds of the lift."""
 REST_TIME = 0.3
-TIPPED = np.deg2rad(45)
-HELD_RISE = 0.5  # of the lift: an object that rose by more is held
+"""Seconds after an action before its last sample."""
+TIPPED_ANGLE = np.deg2rad(45)
+"""Radians by which an object must be tilted to count as tipped over."""
+HELD_RISE = 0.5
+"""Share of the lift that an object must rise to count as held."""
 
 
 def _frames(times: Sequence[Float[Array, "*b"] | float], targets: list[Float[jax.Array, "*b 5"]]) -> Trajectory:
@@ -60,17 +76,15 @@ def push_trajectory(push: Push) -> Trajectory:
     direction = jnp.stack([jnp.cos(push.angle), jnp.sin(push.angle)], -1)
     end = push.start + push.distance[..., None] * direction
     low, gap = GRIPPER.push_tip, GRIPPER.push_gap
-    start_high, start_low = _pose(push.start, CLEAR, yaw, gap), _pose(push.start, low, yaw, gap)
-    end_low, end_high = _pose(end, low, yaw, gap), _pose(end, CLEAR, yaw, gap)
+    start_high, start_low = _pose(push.start, CLEAR_HEIGHT, yaw, gap), _pose(push.start, low, yaw, gap)
+    end_low, end_high = _pose(end, low, yaw, gap), _pose(end, CLEAR_HEIGHT, yaw, gap)
     travel = jnp.asarray(push.distance, jnp.float32) / PUSH_SPEED
     times = (0.0, DESCEND_TIME, 0.1, travel, 0.1, DESCEND_TIME, REST_TIME)
     return _frames(times, [start_high, start_low, start_low, end_low, end_low, end_high, end_high])
 
 
 def push_samples(*, longest: float = PUSH_STEPS * 0.01) -> Float[np.ndarray, " 12"]:
-    """Return the sampled times in seconds: at each centimetre of travel up to 10, and at rest after `longest`
-    metres.
-    """
+    """Return the sampled times in seconds: at each centimetre up to 10, and at rest after `longest` metres."""
     begin = DESCEND_TIME + 0.1
     travel = begin + np.arange(PUSH_STEPS + 1) * 0.01 / PUSH_SPEED
     return np.append(travel, begin + longest / PUSH_SPEED + 0.1 + DESCEND_TIME + REST_TIME)
@@ -119,7 +133,7 @@ def push(
 def tipped(before: Float[Array, "*b 4"], after: Float[Array, "*b 4"]) -> Bool[jax.Array, "*b"]:
     """Return which objects with quaternions (wxyz) have been tipped by over 45 degrees."""
     up = [geometry.quat_to_matrix(jnp.asarray(quat))[..., 2, :] for quat in (before, after)]
-    return (up[0] * up[1]).sum(-1) < np.cos(TIPPED)
+    return (up[0] * up[1]).sum(-1) < np.cos(TIPPED_ANGLE)
 
 
 def grasp(engine: Engine, scenes: Scene, poses: Float[Array, "B N 7"], grasps: Grasp) -> tuple[Rollout, Outcome]:

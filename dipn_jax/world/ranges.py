@@ -10,9 +10,7 @@ from dipn_jax.errors import UserError
 Range: TypeAlias = tuple[float, float]
 """Smallest and largest value."""
 BOUNDS = {"scale": (0.5, 1.2), "density": (10.0, 25_000.0), "friction": (0.01, 5.0)}
-"""Smallest and largest value allowed in each range: cork to platinum; what the renderer's window and the fingers'
-height allow.
-"""
+"""Smallest and largest value allowed in each range, by what camera and fingers allow; densities of cork to platinum."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,13 +20,13 @@ class Ranges:
     items: tuple[str, ...] = ()
     """Names from the catalogue (`shapes.CATALOGUE`); none given: all of them."""
     scale: Range = (0.9, 1.03)
-    """Of each nominal dimension; no side is thinner than 25 mm, no diagonal longer than 126 mm."""
+    """Factor of each nominal dimension; no side is thinner than 25 mm, no diagonal longer than 126 mm."""
     density: Range = (250.0, 750.0)
-    """kg/m^3."""
+    """Density of objects in kg/m^3."""
     friction: Range = (0.28, 0.42)
     """Sliding coefficient between object and table; between objects it is 0.5 / 0.35 of the larger of two."""
     color_noise: float = 0.0
-    """Most by which each channel, in [0, 1], differs from a colour of the palette."""
+    """Largest difference of each colour channel, in [0, 1], from the palette."""
     packed: float = 0.0
     """Share of scenes whose objects are not dropped but stand side by side in rows."""
 

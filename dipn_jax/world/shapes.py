@@ -30,6 +30,7 @@ PARTS = 3
 """Largest number of convex parts of an object."""
 
 Polygon = list[tuple[float, float]]
+"""Corners, counter-clockwise."""
 
 
 def _arc(start: float, stop: float, count: int) -> np.ndarray:
@@ -44,8 +45,9 @@ def _half_disc() -> Polygon:
 
 
 def _notched() -> list[Polygon]:
-    """Return the arch in (z, x): a 26 mm half-round notch in a 100 x 50 mm face, as a trapezoid of equal area and
-    depth.
+    """Return the arch in (z, x): a 100 x 50 mm face with a trapezoid for its half-round notch of 26 mm.
+
+    The trapezoid has the area and the depth of the half disc.
     """
     rim, floor, depth = 0.26, 0.148, 0.02  # of 100 mm, of 100 mm, and x = -1 mm of 50 mm
     left = [(-0.5, -0.5), (-floor, -0.5), (-floor, -depth), (-rim, 0.5), (-0.5, 0.5)]
@@ -134,7 +136,6 @@ class Item:
     size_mm: tuple[float, float, float]
 
 
-# Source: DIPN's released code, evaluation objects first, then its further training objects.
 CATALOGUE = (
     Item("triangle", "triangular_prism", (100, 50, 50)),
     Item("concave", "concave", (50, 50, 100)),
@@ -151,8 +152,8 @@ CATALOGUE = (
     Item("cuboid_square", "cuboid", (70, 70, 25)),
     Item("triangle_flat", "triangular_prism", (66, 56, 30)),
 )
+"""All objects: the evaluation objects of DIPN's released code, then its further training objects."""
 
-# Source: DIPN's released code.
 COLORS_RGB = (
     (78, 121, 167),
     (89, 161, 79),
@@ -165,6 +166,7 @@ COLORS_RGB = (
     (118, 183, 178),
     (255, 157, 167),
 )
+"""The palette of object colours. Source: DIPN's released code."""
 
 MAX_DIAGONAL = 0.126
 """Longest diagonal of a bounding box in metres: such an object fits a window of 64 pixels in any pose."""

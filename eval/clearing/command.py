@@ -1,4 +1,4 @@
-"""`dipn-eval clear` and `sweep`."""
+"""The commands `dipn-eval clear` and `dipn-eval sweep`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from .tables import DEFAULT_TABLES, Tables
 
 if TYPE_CHECKING:
     from dipn_jax.engine import Engine
-    from dipn_jax.planning.methods import PolicyConfig
+    from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.storage import resume
 
     from .on_tables import TablePolicy
 
 MAX_CANDIDATES = 4096
-"""Pushes that may be considered at a time."""
+"""Largest number of pushes that may be considered at a time."""
 SIMULATED_PUSH = 0.10
-"""Metres of a push that are simulated at least: the table is looked at when a push of this length would have ended."""
+"""Metres: a shorter push is simulated until one of this length would have ended."""
 
 
 def clear(
@@ -56,23 +57,23 @@ def clear(
 
     Args:
       out: folder for metrics.json and every step of every table.
-      method: who decides.
+      method: how to decide.
       push_net: run of dipn-train push, or builtin.
       grasp_net: run of dipn-train grasp, or builtin.
       value_net: run of dipn-train baseline.
-      tables: which.
+      tables: the tables to clear.
       candidates: pushes considered at a time.
       distance: metres of a push.
       gamma: discount of a push's value.
       threshold: grasp at once above this score.
-      released: decide by the clauses of DIPN's released code, too: a lone object is grasped, a push must raise the best
+      released: add the clauses of DIPN's released code: a lone object is grasped, a push must raise the best
         score, gamma discounts only pushes after which that is over 0.5, and no object may come near the edge.
-      cautious: GN's score of a grasp is the least of what it says of the grasp and its mirror images, and is halved
-        where the height map speaks against it; no: as published. Means of imagined images are as published anyway.
+      cautious: GN's score of a grasp is the lowest of its scores of the grasp and of its mirror images, halved where
+        a finger would land on something; no: as published. Means of imagined images are always as published.
       remember: halve the scores of grasps like one that missed until something near them moves; no: as published.
-      label: what sets this apart from others of the same method, for the report: the data learnt from, say.
-      seed: of scenes, perturbations and candidates.
-      engine: physics.
+      label: for the report, what distinguishes this evaluation from others of its method, such as the data learnt from.
+      seed: random seed of scenes, perturbations and candidates.
+      engine: physics engine.
     """
     settings = _settings(locals())
     from dipn_jax.physics import make_engine
@@ -96,7 +97,7 @@ def clear(
 
 
 def _settings(given: dict[str, Any]) -> dict[str, Any]:
-    """The options of a command by name, those of its tables as `tables.NAME`."""
+    """Return the options of a command by name, those of its tables as `tables.NAME`."""
     tables: Tables = given["tables"]
     others = {key: value for key, value in given.items() if key != "tables"}
     return others | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
@@ -137,13 +138,13 @@ def sweep(
       push_net: run of dipn-train push, or builtin; beyond 10 cm objects continue as in the last centimetre.
       grasp_net: run of dipn-train grasp, or builtin.
       distances: first:last:step, metres, to 0.12.
-      tables: which.
+      tables: the tables to clear.
       candidates: pushes considered at a time; the choosing policy gives each of them one of the distances.
       pushes: scenes of 1 to 7 objects, a push in each, for the prediction error; 0: do not measure it.
       gamma: discount of a push's value.
       threshold: grasp at once above this score.
-      seed: of scenes, perturbations and candidates.
-      engine: physics.
+      seed: random seed of scenes, perturbations and candidates.
+      engine: physics engine.
     """
     settings = _settings(locals()) | {"method": "dipn+gn", "label": ""}
     from dipn_jax.physics import make_engine
@@ -151,7 +152,7 @@ def sweep(
     from dipn_jax.storage import resume
 
     from .. import metrics
-    from . import on_tables, sweeping
+    from . import sweeping
 
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
@@ -162,16 +163,8 @@ def sweep(
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
     configs[sweeping.CHOSEN] = chosen
     networks, physics = Networks(push_net, grasp_net), make_engine(engine)
-    runs = networks.runs("dipn+gn")
-    kept = resume.Partial(out, settings, inputs=_inputs(runs, tables))
-    ended: dict[str, dict[str, Any]] = kept.load({})
-    policies = on_tables.load("dipn+gn", networks, physics, list(configs.values()))
-    for name, decide in zip(configs, policies, strict=True):
-        if name not in ended:
-            mine = settings | {"label": name}
-            ended[name] = _clear(out / name, decide, physics, tables, settings=mine, runs=runs, longest=max(every))
-            kept.save(ended)
-    values = {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
+    kept = resume.Partial(out, settings, inputs=_inputs(networks.runs("dipn+gn"), tables))
+    values = _clear_with_each(out, configs, networks, physics, tables, settings=settings, kept=kept)
     if pushes:
         values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
     sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
@@ -180,10 +173,39 @@ def sweep(
     console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
 
 
+def _clear_with_each(
+    out: pathlib.Path,
+    configs: dict[str, PolicyConfig],
+    networks: Networks,
+    physics: Engine,
+    tables: Tables,
+    *,
+    settings: dict[str, Any],
+    kept: resume.Partial,
+) -> dict[str, Any]:
+    """Clear the same tables with each of `configs`, in a folder of its name; continues where it was interrupted.
+
+    Returns:
+      All metrics, as `sweep/NAME/METRIC`.
+    """
+    from . import on_tables
+
+    runs = networks.runs("dipn+gn")
+    longest = max(max(config.distances) for config in configs.values())
+    ended: dict[str, dict[str, Any]] = kept.load({})
+    policies = on_tables.load("dipn+gn", networks, physics, list(configs.values()))
+    for name, decide in zip(configs, policies, strict=True):
+        if name not in ended:
+            named = settings | {"label": name}
+            ended[name] = _clear(out / name, decide, physics, tables, settings=named, runs=runs, longest=longest)
+            kept.save(ended)
+    return {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
+
+
 def _prediction_errors(
     push_net: pathlib.Path, physics: Engine, distances: tuple[float, ...], *, scenes: int, seed: int
 ) -> dict[str, float]:
-    """Errors of the predicted masks at each of `distances`, one push on each of `scenes` as published."""
+    """Measure the errors of predicted masks at each of `distances`: one push on each of `scenes` as published."""
     from dipn_jax.planning.predictors import load_predictor
     from dipn_jax.world.scenes import PAPER
 
@@ -196,7 +218,7 @@ def _prediction_errors(
 
 
 def _inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]:
-    """The runs and files that the results depend on, besides the options."""
+    """Return the runs and files that the results depend on, besides the options."""
     path = tables.path()
     return [*runs.values(), *([path] if path else [])]
 
@@ -217,12 +239,12 @@ def _clear(
     Args:
       out: folder of the results.
       decide: decides on every table.
-      physics: physics.
-      tables: which tables.
+      physics: physics engine.
+      tables: the tables to clear.
       settings: options, for `settings.json`.
       runs: networks that `decide` uses.
       longest: metres of the longest push.
-      remember: whether grasps like one that missed are doubted.
+      remember: whether the scores of grasps like one that missed are halved.
 
     Returns:
       The metrics.

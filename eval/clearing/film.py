@@ -1,4 +1,4 @@
-"""Episodes of clearing a table, kept as states: pictures of any step are drawn when they are wanted."""
+"""Episodes of clearing a table, stored as states: pictures of any step are rendered when they are needed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .instances import Instance
 
 @dataclasses.dataclass(frozen=True)
 class Film:
-    """T actions on one table of N objects."""
+    """The states and decisions of T actions on one table of N objects."""
 
     what: np.ndarray  # [T] str: push, grasp held, grasp missed
     shape: np.ndarray  # [T + 1, N] int32: which objects there are, before each action and at the end
@@ -36,12 +36,12 @@ class Film:
     friction: np.ndarray  # [N]
 
     def before(self, step: int) -> np.ndarray:
-        """Colours `[224, 224, 3]` before an action."""
+        """Return the colours `[224, 224, 3]` before an action."""
         scene = Scene(self.shape[step], self.size, self.color, self.mass, self.friction)
         return np.asarray(render.render(scene, self.poses[step]).color)
 
     def pictures(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colours `[224, 224, 3]` before an action, as predicted for the best push, and after the action."""
+        """Return the colours `[224, 224, 3]` before an action, as predicted for the best push, and after the action."""
 
         def scene(at: int) -> Scene:
             return Scene(self.shape[at], self.size, self.color, self.mass, self.friction)

@@ -16,9 +16,11 @@ from dipn_jax.world import cases as case_files
 from dipn_jax.world import clutter, primitives, scenes
 
 JITTER = 0.002
-"""Metres by which an object of a repeated case is moved at most."""
-MASS_FACTOR, FRICTION_FACTOR = (0.8, 1.2), (0.85, 1.15)
-"""By which those of its objects are multiplied."""
+"""Largest distance in metres by which an object of a repeated case is moved."""
+MASS_FACTOR = (0.8, 1.2)
+"""Range of the factor on the mass of each object of a repeated case."""
+FRICTION_FACTOR = (0.85, 1.15)
+"""Range of the factor on its friction."""
 
 
 @dataclasses.dataclass
@@ -36,7 +38,7 @@ class Instance:
     ended: str = ""  # cleared, pushed out, out of actions, fault
     did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action
     missed: tuple[np.ndarray, ...] = ()  # grasps [3] that missed and around which nothing has moved since
-    film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # what preceded each action
+    film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # poses and decision before each action
 
     @property
     def actions(self) -> int:
@@ -46,9 +48,10 @@ class Instance:
 def hard_instances(
     engine: Engine, path: pathlib.Path, names: list[str] | None, *, slots: int, repeats: int, seed: int
 ) -> list[Instance]:
-    """The cases of a file, settled; `repeats` of each, all but the first moved by up to JITTER and reweighed.
+    """Return the settled cases of a file, `repeats` of each; all but the first are slightly different.
 
-    A repeat of a case is the same however many others there are.
+    Their objects are moved by up to JITTER, their masses and frictions multiplied by random factors. A repeat of a case
+    does not depend on how many others there are.
 
     Raises:
       UserError: a name is not in the file.
@@ -82,7 +85,7 @@ def hard_instances(
 
 
 def random_instances(engine: Engine, config: scenes.SceneConfig, *, count: int, seed: int) -> list[Instance]:
-    """`count` random settled scenes."""
+    """Return `count` random settled scenes."""
     items = clutter.settled_scenes(jax.random.key(seed), engine, config, count)
     return _instances([f"random-{i}" for i in range(count)], items.scene, np.asarray(items.poses))
 

@@ -1,4 +1,4 @@
-"""Clear tables, many instances in lockstep, to the end rules of the paper."""
+"""Clear many tables in lockstep, by the end rules of the paper."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from .instances import Instance
 from .on_tables import TablePolicy
 
 ACTIONS_PER_OBJECT = 3
-"""Source: the paper; more actions than that is a failure."""
+"""Most actions per object; a table that needs more is not cleared. Source: the paper."""
 REMEMBERED_MISSES = 8
-"""How many of the latest grasps that missed are remembered."""
+"""Number of the latest grasps that missed that are remembered."""
 MOVED_DISTANCE = 0.005
-"""Metres: an object that has moved by more makes grasps near it worth trying again."""
+"""Metres by which an object must move for grasps near it to be worth trying again."""
 NEAR_GRASP = 0.06
-"""Metres: how far from the centre of a grasp an object counts as near it."""
+"""Metres from the centre of a grasp within which an object counts as near it."""
 _NONE_MISSED = np.repeat(planner.NONE_MISSED, REMEMBERED_MISSES, axis=0)
 
 
@@ -44,18 +44,18 @@ def clear(
     longest: float = PUSH_STEPS * 0.01,
     remember: bool = True,
 ) -> list[Instance]:
-    """Act on every instance until all have ended; those that have not are decided on, and simulated, together.
+    """Act on every instance until all have ended; those that have not ended are decided on and simulated together.
 
     What happens on one table does not depend on the others.
 
     Args:
       instances: settled tables; changed in place, or replaced by those of an interrupted evaluation.
-      engine: physics.
-      decide: what to do next.
+      engine: physics engine.
+      decide: the policy.
       partial: where an interrupted evaluation is kept.
-      seed: of the push candidates.
+      seed: random seed of the push candidates.
       longest: metres of the longest push that `decide` asks for.
-      remember: tell `decide` of the grasps that missed around which nothing has moved since.
+      remember: give `decide` the grasps that missed and near which nothing has moved since.
 
     Returns:
       The instances, ended.
@@ -112,7 +112,7 @@ def _grasp(rows: list[Instance], decision: Decision, engine: Engine) -> None:
 
 
 def _record(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: Decision) -> None:
-    """Keep what a frame can be drawn from again: where everything was, and what was decided."""
+    """Record what an episode's pictures can be rendered from: the poses before the action, and the decision."""
     push = decision.push
     instance.film.append(
         {
@@ -127,12 +127,12 @@ def _record(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: 
 
 
 def _missed(instance: Instance) -> np.ndarray:
-    """The grasps that missed, padded: `[REMEMBERED_MISSES, 3]`."""
+    """Return the grasps that missed, padded to `[REMEMBERED_MISSES, 3]`."""
     return np.stack([*instance.missed, *_NONE_MISSED[len(instance.missed) :]])
 
 
 def _update_missed(instance: Instance, state: tuple[np.ndarray, np.ndarray], grasp: np.ndarray) -> None:
-    """Keep in mind a grasp that missed, and forget those around which something has moved or is gone."""
+    """Remember a grasp that missed, and forget those near which an object has moved or is gone."""
     shape, poses = state
     missed = instance.missed + ((grasp,) if instance.did[-1] == "grasp missed" else ())
     stayed = np.linalg.norm(instance.poses[:, :2] - poses[:, :2], axis=-1) < MOVED_DISTANCE
@@ -152,7 +152,7 @@ def _ended(instance: Instance) -> str:
 
 
 def summary(instances: list[Instance]) -> dict[str, Any]:
-    """Flat metrics, each with a bootstrap 95 % interval over instances (`_low`, `_high`).
+    """Return flat metrics, each with a bootstrap 95 % interval over instances (`_low`, `_high`).
 
     As in the paper: completion is instances cleared over instances, grasp success is objects grasped over grasp
     actions, efficiency is objects removed over all actions; the last two over all instances and over completed ones,
@@ -182,7 +182,9 @@ def summary(instances: list[Instance]) -> dict[str, Any]:
 
 
 def save(instances: list[Instance], out: pathlib.Path) -> None:
-    """Every step of every instance, as `episodes/NUMBER.npz` (see `eval.film`), and a list of them, `episodes.json`."""
+    """Write every step of every instance to `episodes/NUMBER.npz` (see `eval.film`), and `episodes.json`, their
+    list.
+    """
     lines = []
     for number, instance in enumerate(instances):
         stem = f"{number:03d}"

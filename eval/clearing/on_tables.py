@@ -1,4 +1,4 @@
-"""Decisions on many tables at once: a method's policy in lockstep, or the engine itself as predictor."""
+"""Decisions on many tables at once: by a method's policy, or with the engine itself as predictor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dipn_jax.structs import Array, Decision, Scene
 from . import rollouts
 
 TablePolicy = Callable[[jax.Array, Scene, Array, Array], Decision]
-"""(keys [B], scenes [B, N], poses [B, N, 7], grasps that missed [B, M, 3]) -> brief decisions [B], numpy."""
+"""(keys [B], scenes [B, N], poses [B, N, 7], grasps that missed [B, M, 3]) -> brief decisions [B], NumPy."""
 
 
 def load(method: str, networks: Networks, engine: Engine, configs: list[PolicyConfig]) -> list[TablePolicy]:
@@ -29,7 +29,7 @@ def load(method: str, networks: Networks, engine: Engine, configs: list[PolicyCo
       method: a name of `methods.METHODS`.
       networks: runs.
       engine: physics, for `physics+gn`.
-      configs: as many candidates in each, and alike in everything but distances and rule.
+      configs: equal in everything, the number of candidates included, except distances and rule.
 
     Raises:
       UserError: a network that the method needs was not given, or is another.
@@ -46,7 +46,7 @@ def load(method: str, networks: Networks, engine: Engine, configs: list[PolicyCo
 
 
 def in_lockstep(policy: Policy) -> TablePolicy:
-    """A policy of one table as one of many, which are drawn and decided on in one call."""
+    """Make a policy of one table into one of many, which are rendered and decided on in one call."""
 
     def decide(keys: jax.Array, scene: Scene, poses: Array, missed: Array) -> Decision:
         each = functools.partial(_decide_each, act=policy.act, rule=policy.rule, distances=policy.distances)
@@ -68,7 +68,7 @@ def _decide_each(
     rule: Rule,
     distances: jax.Array,
 ) -> Decision:
-    """Decisions on the tables that are real, one after another: a decision is itself a batch of images."""
+    """Decide on the tables that are real, one after another: a decision is itself a batch of images."""
 
     def one(key: jax.Array, scene: Scene, poses: jax.Array, missed: jax.Array) -> Decision:
         return act(key, render.render(scene, poses), missed, rule, distances).brief()

@@ -1,4 +1,4 @@
-"""Decisions with the engine itself as predictor: the ceiling of imagination (`physics+gn`)."""
+"""Decisions with the engine itself as predictor (`physics+gn`), which no network can be expected to beat."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def decide(
       missed: `[B, M, 3]` grasps that missed.
       scorer: scores of every grasp.
       summarize: mean and highest score of all grasps on predicted images.
-      engine: physics.
+      engine: physics engine.
       rule: how to compare.
       distances: `[P]` metres of the candidates.
 

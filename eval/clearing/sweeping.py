@@ -1,4 +1,4 @@
-"""How far should one push? Prediction, completion and efficiency against the distance, and a policy that chooses it."""
+"""How far should one push? Prediction, completion and efficiency at each distance, and a policy that chooses it."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ from .. import drawing, metrics
 CHOSEN = "chosen"
 """Name of the policy that chooses the distance of each push."""
 SHOWN = ("completion", "grasp_success_all", "efficiency_all")
+"""Metrics of clearing that the table and the figure show."""
 
 
 def parse(text: str) -> tuple[float, ...]:
-    """Distances of `first:last:step`, in metres, both ends included.
+    """Return the distances of `first:last:step`, in metres, both ends included.
 
     Raises:
       UserError: it is none.
@@ -49,7 +50,7 @@ def parse(text: str) -> tuple[float, ...]:
 
 
 def name(distance: float) -> str:
-    """Of a distance in metrics: `0.03`."""
+    """Return how a distance is written in metric names, such as `0.03`."""
     return f"{distance:g}"
 
 
@@ -63,15 +64,15 @@ def prediction_errors(
     seed: int,
     longest: float,
 ) -> dict[str, float]:
-    """True 1-IoU of the predicted masks after one push a scene, made anew for every distance from the same start.
+    """Measure true 1-IoU of predicted masks after one push per scene, the same pushes at every distance.
 
     Args:
       predictor: of `config.slots` objects.
-      engine: what truth is; at rest, the gripper gone.
+      engine: the engine whose result counts as the truth, at rest and without the gripper.
       config: scenes.
       distances: metres.
-      scenes: how many.
-      seed: of scenes and pushes.
+      scenes: number of scenes.
+      seed: random seed of scenes and pushes.
       longest: metres that are simulated, the same for all distances.
 
     Returns:
@@ -116,7 +117,7 @@ def _look(keys: jax.Array, scene: Scene, poses: jax.Array) -> tuple[Observation,
 def _errors(
     seen: Observation, pushes: Push, scene: Scene, before: jax.Array, after: jax.Array, *, predictor: Predictor
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """1-IoU `[B, N]` of predicted masks; which objects were in sight, and which of them moved."""
+    """Return 1-IoU `[B, N]` of predicted masks, which objects were in sight, and which of them moved."""
 
     def one(args: tuple[Observation, Push, Scene, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         seen, push, scene, before, after = args
@@ -133,13 +134,13 @@ def _errors(
 
 
 def names(values: dict[str, Any]) -> list[str]:
-    """What was swept, in order, the choosing policy last."""
+    """Return the names of what was swept, in order, the choosing policy last."""
     found = {key.split("/")[1] for key in values if key.startswith("sweep/")}
     return [*sorted(found - {CHOSEN}, key=float), *(found & {CHOSEN})]
 
 
 def table(values: dict[str, Any]) -> str:
-    """An HTML table of a sweep."""
+    """Return an HTML table of a sweep."""
     head = ["metres", "prediction error, moved", *[f"{key.replace('_', ' ')} %" for key in SHOWN], "pushes"]
     rows = []
     for each in names(values):
@@ -151,7 +152,7 @@ def table(values: dict[str, Any]) -> str:
 
 
 def figure(values: dict[str, Any]) -> Any:
-    """Prediction error, completion, grasp success and efficiency against distance; the choosing policy as a line."""
+    """Plot prediction error, completion, grasp success and efficiency against distance."""
     each = [one for one in names(values) if one != CHOSEN]
     x = [100 * float(one) for one in each]
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.2))

@@ -1,4 +1,4 @@
-"""Which tables are cleared: options of `dipn-eval clear` and `sweep`, so importing this imports no JAX."""
+"""Which tables are cleared, options of `dipn-eval clear` and `sweep`. Importing this imports no JAX."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Tables:
             raise UserError("--names: random tables have none; give --cases hard or a case file")
 
     def path(self) -> pathlib.Path | None:
-        """The case file; None for random tables."""
+        """Return the case file; None for random tables."""
         from dipn_jax.world import cases as case_files
 
         if self.cases == "random":
@@ -42,7 +42,7 @@ class Tables:
         return case_files.hard_cases_path() if self.cases == "hard" else pathlib.Path(self.cases)
 
     def slots(self) -> int:
-        """The largest number of objects on one of the tables."""
+        """Return the largest number of objects on one of the tables."""
         from dipn_jax.world import cases as case_files
         from dipn_jax.world import scenes
 
@@ -52,7 +52,7 @@ class Tables:
         return int(case_files.load_cases(path)[1].shape.shape[1])
 
     def make(self, engine: Engine, *, seed: int) -> list[Instance]:
-        """All tables, at rest."""
+        """Make all tables, at rest."""
         from dipn_jax.world import scenes
 
         from .instances import hard_instances, random_instances
@@ -67,3 +67,4 @@ class Tables:
 
 
 DEFAULT_TABLES = Tables()
+"""The tables that are cleared unless told otherwise."""

@@ -1,4 +1,4 @@
-"""`dipn-eval grasp`."""
+"""The command `dipn-eval grasp`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def grasp(
     engine: EngineName = "auto",
     ranges: Ranges = DEFAULT_RANGES,
 ) -> None:
-    """Success of the best-scored grasp, over every attempt until the tables are empty; a random grasp beside it.
+    """Measure how often the best-scored grasp holds until the tables are empty, and how often a random one does.
 
       dipn-eval grasp --grasp-net builtin --out results/grasp
 
@@ -38,12 +38,12 @@ def grasp(
       out: folder for metrics.json, pictures and every step of every table.
       grasp_net: run of dipn-train grasp, or builtin.
       curve: runs of dipn-train grasp-online of different --seed, with and without --init.
-      scenes_: how many tables.
+      scenes_: number of tables.
       objects: number of objects on a table.
-      seed: of scenes and random grasps; keep it away from the training data's.
+      seed: random seed of scenes and random grasps; keep it away from the training data's.
       others: where a grasp missed, also try this many of the next best ones, to see what physics allows.
-      engine: physics.
-      ranges: what random objects are drawn from.
+      engine: physics engine.
+      ranges: the ranges that random objects are drawn from.
     """
     settings = dict(locals())
     options.check(out, seed, scenes=scenes_)

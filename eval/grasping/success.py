@@ -28,6 +28,7 @@ from ..clearing import instances, lockstep, on_tables
 from ..clearing.instances import Instance
 
 BINS = 10
+"""Number of bins of scores."""
 
 
 def evaluate(
@@ -40,16 +41,16 @@ def evaluate(
     seed: int,
     others: int = 0,
 ) -> tuple[dict[str, Any], list[Instance]]:
-    """Grasp greedily until every table is empty, by the end rules of `eval.clearing`; a random grasp on each besides.
+    """Try the best-scored grasp until every table is empty, by the end rules of `eval.clearing`; also a random one.
 
     Args:
       scorer: scores of every grasp.
-      engine: physics.
+      engine: physics engine.
       config: scenes.
       partial: where an interrupted evaluation is kept.
-      scenes: how many tables.
-      seed: of the scenes and of the random grasps.
-      others: where a grasp missed, try so many others of the best, each from the same state; 0: none.
+      scenes: number of tables.
+      seed: random seed of the scenes and of the random grasps.
+      others: where a grasp missed, how many of the next best to try, each from the same state; 0: none.
 
     Returns:
       Flat metrics: success with bootstrap 95 % intervals over tables, calibration; and the tables, ended.
@@ -75,7 +76,7 @@ def _rate(name: str, hits: Any, trials: Any) -> dict[str, float]:
 
 
 def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], seed: int) -> dict[str, Any]:
-    """A grasp of a random foreground pixel at a random angle on each table, and what the scorer thinks of it."""
+    """Try a grasp of a random foreground pixel on each table; return how it went and what the scorer said."""
     scene = structs.stack([table.scene for table in tables])
     poses = np.stack([table.poses for table in tables])
     keys = jax.random.split(jax.random.key(seed), len(tables))
@@ -100,7 +101,7 @@ def _random_grasp(keys: jax.Array, scene: Scene, poses: jax.Array, *, scorer: Sc
 
 
 def _other_grasps(scorer: Scorer, engine: Engine, tables: list[Instance], count: int) -> dict[str, float]:
-    """Where GN missed: would one of the next best grasps, 16 mm apart, have held? The ceiling that physics sets."""
+    """Measure how often one of the next best grasps, 16 mm apart, would have held where GN missed."""
     states = [
         (t.scene.replace(shape=s["shape"]), s["poses"])
         for t in tables
@@ -143,13 +144,13 @@ def _next_best(scene: Scene, poses: jax.Array, *, scorer: Scorer, count: int) ->
 
 
 def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: int, each: int = 4) -> dict[str, float]:
-    """How often the labels of pre-training say what physics says, of random grasps of the foreground.
+    """Measure how often the labels of pre-training agree with physics, for random grasps of the foreground.
 
     Args:
-      engine: physics.
+      engine: physics engine.
       config: scenes; one object in each to see what the rule is worth by itself.
-      scenes: how many.
-      seed: of scenes and grasps.
+      scenes: number of scenes.
+      seed: random seed of scenes and grasps.
       each: grasps on every scene.
     """
     items = clutter.settled_scenes(jax.random.key(seed), engine, config, scenes)
@@ -176,7 +177,7 @@ def _labelled(keys: jax.Array, scene: Scene, poses: jax.Array, *, count: int) ->
 
 
 def calibration(scores: np.ndarray, success: np.ndarray) -> dict[str, float]:
-    """Expected calibration error over ten equal bins of score (Naeini et al. 2015), and the bins.
+    """Return the expected calibration error over ten equal bins of score (Naeini et al. 2015), and the bins.
 
     Args:
       scores: `[A]` in [0, 1].
@@ -196,7 +197,7 @@ def calibration(scores: np.ndarray, success: np.ndarray) -> dict[str, float]:
 
 
 def reliability_figure(values: dict[str, Any]) -> Any:
-    """Success against score: the grasps that GN chose, and random ones."""
+    """Plot success against score: the grasps that GN chose, and random ones."""
     figure, axis = plt.subplots(figsize=(4.2, 4))
     axis.plot([0, 1], [0, 1], color="grey", lw=1)
     for prefix, label in (("", "chosen by GN"), ("random/", "random")):

@@ -1,4 +1,4 @@
-"""`dipn-eval prediction`."""
+"""The command `dipn-eval prediction`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def predict(
     segmented: bool = True,
     ranges: Ranges = DEFAULT_RANGES,
 ) -> None:
-    """Error of the predicted masks after 5 and 10 cm of a push, on scenes never trained on.
+    """Measure the error of the predicted masks after 5 and 10 cm of a push, on scenes never trained on.
 
       dipn-eval prediction --push-net runs/dipn --out results/prediction
       dipn-eval prediction --push-net builtin --density 1000 1500 --out results/heavier
@@ -44,31 +44,28 @@ def predict(
       curve: runs of dipn-train push with different --limit and --seed.
       scenes_: number of pushes, one in each scene.
       objects: number of objects in a scene.
-      seed: of scenes and pushes; keep it away from the training data's.
+      seed: random seed of scenes and pushes; keep it away from the training data's.
       engine: the engine whose result counts as the truth.
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
       segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
-      ranges: what random objects are drawn from.
+      ranges: the ranges that random objects are drawn from.
     """
     settings = dict(locals())
     options.check(out, seed, scenes=scenes_)
     if not push_net and not curve:
         raise UserError("prediction: nothing to measure; give --push-net or --curve")
     from dipn_jax.physics import make_engine
-    from dipn_jax.storage import checkpoint, resume
+    from dipn_jax.storage import resume
     from dipn_jax.world import scenes
 
     from .. import curves
     from . import push_errors
 
     config = scenes.parse_objects(objects, ranges=ranges)
-    run = checkpoint.find(push_net, network="dipn") if push_net else None
-    runs = [checkpoint.find(each, network="dipn") for each in curve]
-    compared = curves.load_push_runs(runs)
-    networks: dict[str, Any] = {"dipn": checkpoint.load_network(run, network="dipn")} if run else {}
-    partial = resume.Partial(out, settings, inputs=[*([run] if run else []), *runs])
+    networks, compared, runs = _load(push_net, curve)
+    partial = resume.Partial(out, settings, inputs=runs)
     values, films = push_errors.evaluate(
-        networks | compared,
+        networks,
         make_engine(engine),
         config,
         partial,
@@ -78,9 +75,28 @@ def predict(
         segmented=segmented,
     )
     kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in compared)}
-    values = kept | curves.push_summary(values, list(compared))
+    values = kept | curves.push_summary(values, compared)
     _save_pictures(out, films, values, curve=bool(curve))
     options.finish(out, values, settings, partial)
+
+
+def _load(
+    push_net: pathlib.Path | None, curve: tuple[pathlib.Path, ...]
+) -> tuple[dict[str, Any], list[str], list[pathlib.Path]]:
+    """Load the networks to measure, `push_net` as `dipn`.
+
+    Returns:
+      All networks by name, the names of those of the learning curve, and the runs of all.
+    """
+    from dipn_jax.storage import checkpoint
+
+    from .. import curves
+
+    single = [checkpoint.find(push_net, network="dipn")] if push_net else []
+    runs = [checkpoint.find(each, network="dipn") for each in curve]
+    compared = curves.load_push_runs(runs)
+    networks = {"dipn": checkpoint.load_network(single[0], network="dipn")} if single else {}
+    return networks | compared, list(compared), [*single, *runs]
 
 
 def _save_pictures(out: pathlib.Path, films: dict[str, np.ndarray], values: dict[str, float], *, curve: bool) -> None:

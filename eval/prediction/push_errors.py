@@ -1,4 +1,4 @@
-"""How well is a push predicted? DIPN against nothing moves, only the pushed object moves, and the engine itself."""
+"""How well is a push predicted? DIPN beside two simple predictors and the engine itself."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from dipn_jax.world.scenes import SceneConfig
 from .pushes import DISTANCES, Executed, execute
 
 MAX_ATTEMPTS = 100
-"""Batches without a usable push before giving up."""
+"""Batches in a row without a usable push after which an evaluation gives up."""
 FILMS = 6
-"""Pushes kept as pictures."""
+"""Number of pushes kept as pictures."""
 SEGMENTED = "_segmented"
-"""Ends the name of a predictor that is given masks found in the image."""
+"""End of the name of a predictor that is given masks found in the image."""
 _METRES = np.array(DISTANCES, np.float32) * 0.01
 
 Predict = Callable[[Observation, Push], jax.Array]
 """(observations [B], pushes [B]) -> motion [B, K, N, 3] after DISTANCES: dx, dy (metres), dtheta (radians)."""
 Rows = dict[str, list[np.ndarray]]
-"""Errors `[B, K, N]` of each batch, by predictor and measure; what was `visible` and what `moved`."""
+"""Errors `[B, K, N]` of each batch, by predictor and measure; also which masks were `visible` and which `moved`."""
 
 
 def evaluate(
@@ -49,15 +49,15 @@ def evaluate(
     physics: bool,
     segmented: bool,
 ) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """Errors of every predictor on held-out scenes, one push each.
+    """Measure the errors of every predictor on held-out scenes, one push each.
 
     Args:
       networks: what to measure by the name it gets in the metrics; the first also makes the pictures.
-      engine: what truth is.
+      engine: the engine whose result counts as the truth.
       config: scenes.
       partial: where an interrupted evaluation is kept.
-      scenes: how many.
-      seed: of the scenes and pushes.
+      scenes: number of scenes.
+      seed: random seed of the scenes and pushes.
       physics: also roll the engine out with nominal mass and friction.
       segmented: also measure with masks found in the image.
 
@@ -82,7 +82,7 @@ def evaluate(
                 films += [executed.film(seen, motions, i) for i in range(min(FILMS - len(films), len(executed)))]
             empty = 0 if len(executed) else empty + 1
             if empty == MAX_ATTEMPTS:
-                raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; loosen the scenes")
+                raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; give fewer --objects")
             progress.advance(len(executed))
             done, batch = done + len(executed), batch + 1
             partial.save((done, batch, rows, films))
@@ -91,7 +91,7 @@ def evaluate(
 
 
 def _with_baselines(networks: Mapping[str, DIPN]) -> dict[str, Predict]:
-    """The networks as predictors, then `static` (nothing moves) and `trans` (the pushed object moves along)."""
+    """Return the networks as predictors, then `static` (nothing moves) and `trans` (the pushed object moves along)."""
     predictors = {name: network_predictor(network) for name, network in networks.items()}
     return predictors | {
         "static": at_distances(static_predictor),
@@ -100,7 +100,7 @@ def _with_baselines(networks: Mapping[str, DIPN]) -> dict[str, Predict]:
 
 
 def network_predictor(network: DIPN) -> Predict:
-    """A network as it is measured here; networks of one architecture share a compiled function."""
+    """Return a network as it is measured here; networks of one architecture share a compiled function."""
     graph, state = nnx.split(network)
     distances = lambda count: np.broadcast_to(_METRES, (count, len(_METRES)))  # noqa: E731
     return lambda seen, pushes: batching.in_batches(
@@ -114,7 +114,7 @@ def _network_motions(graph: Any, state: Any, seen: Observation, pushes: Push, di
 
 
 def at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict:
-    """A planner's predictor as one of batches; a baseline's push is made once for each distance."""
+    """Make a planner's predictor into one of batches; a baseline's push is made once for each distance."""
 
     @jax.jit
     def predict(seen: Observation, pushes: Push) -> jax.Array:
@@ -128,7 +128,7 @@ def at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict
 
 
 def _found(seen: Observation, slots: int) -> np.ndarray:
-    """Labels `[B, H, W]` of masks found in the images, numbered as the objects that they overlap most."""
+    """Find masks in the images and return their labels `[B, H, W]`, numbered as the objects that they overlap most."""
     images = zip(seen.height, seen.color, seen.label, strict=True)
     return np.stack([segment.find(*image, slots=slots)[0] for image in images])
 
@@ -136,7 +136,7 @@ def _found(seen: Observation, slots: int) -> np.ndarray:
 def measure(
     rows: Rows, executed: Executed, predictors: Mapping[str, Predict], seen: Observation, *, suffix: str = ""
 ) -> np.ndarray:
-    """Append the errors of a batch to `rows`; returns the first predictor's motions `[B, K, N, 3]`.
+    """Append the errors of a batch to `rows`; return the first predictor's motions `[B, K, N, 3]`.
 
     Args:
       rows: grows by `NAME SUFFIX/MEASURE` `[B, K, N]` for each predictor, and by `visible` and `moved` where there is
@@ -144,7 +144,7 @@ def measure(
       executed: pushes `[B]` and what they did; `rolled` is measured as the predictor `physics`.
       predictors: what to measure.
       seen: `[B]` what the predictors see.
-      suffix: of the predictors' names.
+      suffix: end of the predictors' names.
     """
     truth, after = executed.truth, executed.labels_after
     centers, motion = batching.in_batches(_true_motion, seen.label, truth)
@@ -165,7 +165,7 @@ def measure(
 
 @jax.jit
 def _true_motion(label: jax.Array, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Centroids `[B, N, 2]` of the masks seen and how poses `[B, 1 + K, N, 7]` move them `[B, K, N, 3]`."""
+    """Return centroids `[B, N, 2]` of visible masks and how poses `[B, 1 + K, N, 7]` move them `[B, K, N, 3]`."""
     centers, _ = jax.vmap(lambda one: masks.mask_centers(one, poses.shape[2]))(label)
     return centers, geometry.planar_motion(poses[:, :1], poses[:, 1:], centers[:, None])
 
@@ -174,7 +174,7 @@ def _true_motion(label: jax.Array, poses: jax.Array) -> tuple[jax.Array, jax.Arr
 def _errors(
     seen: Observation, centers: jax.Array, motion: jax.Array, true_motion: jax.Array, after: jax.Array
 ) -> dict[str, jax.Array]:
-    """Errors `[B, K, N]` of motions `[B, K, N, 3]` against true ones and true labels `[B, K, H, W]`."""
+    """Return the errors `[B, K, N]` of motions `[B, K, N, 3]` against true ones and true labels `[B, K, H, W]`."""
     slots = centers.shape[1]
 
     def one(args: tuple[Observation, jax.Array, jax.Array, jax.Array]) -> Any:

@@ -1,4 +1,4 @@
-"""Pushes on held-out scenes, executed: what predictions are compared with."""
+"""Executed pushes on held-out scenes, with which predictions are compared."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DISTANCES = (5, 10)
 
 @dataclasses.dataclass(frozen=True)
 class Executed:
-    """A batch of pushes that were executed and whose simulation can be believed; numpy."""
+    """A batch of executed pushes whose simulation can be used; NumPy arrays."""
 
     items: SettledScene  # [B] before the pushes
     pushes: Push  # [B]
@@ -36,17 +36,17 @@ class Executed:
         return len(self.pushes.angle)
 
     def seen(self) -> Observation:
-        """What the camera sees before the pushes `[B]`, numpy."""
+        """Return what the camera sees before the pushes `[B]`, as NumPy arrays."""
         return jax.tree.map(np.asarray, render.observe(self.items.scene, self.items.poses))
 
     @functools.cached_property
     def labels_after(self) -> np.ndarray:
-        """True labels `[B, K, H, W]` after each distance."""
+        """Return the true labels `[B, K, H, W]` after each distance."""
         each = [render.observe(self.items.scene, self.truth[:, 1 + k]).label for k in range(len(DISTANCES))]
         return np.stack([np.asarray(label) for label in each], 1)
 
     def film(self, seen: Observation, motions: np.ndarray, i: int) -> dict[str, np.ndarray]:
-        """Pictures of push `i`: before, predicted with `motions [B, K, N, 3]`, after the longest distance."""
+        """Return pictures of push `i`: before, predicted with `motions [B, K, N, 3]`, after the longest distance."""
         image, push = structs.take(seen, i), structs.take(self.pushes, i)
         centers, _ = masks.mask_centers(jnp.asarray(image.label), self.truth.shape[2])
         after = render.render(structs.take(self.items.scene, i), self.truth[i, -1])
@@ -59,7 +59,7 @@ class Executed:
 
 
 def execute(key: jax.Array, engine: Engine, config: SceneConfig, count: int, *, physics: bool) -> Executed:
-    """A push on each of `count` settled scenes, of those on which one is feasible and goes well."""
+    """Execute a push on each of `count` settled scenes and return those that were feasible and went well."""
     drop, aim = jax.random.split(key)
     items = clutter.settled_scenes(drop, engine, config, count)
     aimed, feasible = _one_push(jax.random.split(aim, len(items.fault)), items.scene, items.poses)

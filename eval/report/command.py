@@ -1,4 +1,4 @@
-"""`dipn-eval report`."""
+"""The command `dipn-eval report`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def report(
     sweeps: Annotated[pathlib.Path | None, tyro.conf.arg(name="sweep")] = None,
     runs: tuple[pathlib.Path, ...] = (),
 ) -> None:
-    """One self-contained report.html from the folders of other commands, and their numbers in one metrics.json.
+    """Write one self-contained report.html from the folders of other commands, and their numbers in one metrics.json.
 
       dipn-eval report --prediction results/prediction --clear results/hard results/30 --runs runs/dipn --out results
 

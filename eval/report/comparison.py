@@ -1,4 +1,4 @@
-"""Methods side by side: tables beside the paper's, why tables were not cleared, and films of some."""
+"""Methods side by side: tables beside the paper's, why tables were not cleared, and films of some of them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from ..clearing import film, lockstep
 from . import paper
 
 FRAMES = 10
-"""Pictures of a film."""
+"""Number of pictures in a filmstrip."""
 FILM_ROWS = 4
+"""Number of steps in the figure of predictions."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",
@@ -26,10 +27,11 @@ CAUSES = {
     "out of actions": "more than three actions an object",
     "fault": "the simulation went wrong",
 }
+"""How a table can end, and how the report says it."""
 
 
 class Cleared:
-    """The folder of a `dipn-eval clear`."""
+    """The results in the folder of a `dipn-eval clear`."""
 
     def __init__(self, folder: pathlib.Path) -> None:
         self.folder = folder
@@ -42,12 +44,12 @@ class Cleared:
 
     @property
     def name(self) -> str:
-        """Of the method, and what sets it apart."""
+        """The name of the method, with its label if it has one."""
         return f"{self.method} ({self.label})" if self.label else self.method
 
 
 def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
-    """`clear/TABLES/METHOD/...` for the report's metrics; `clear/TABLES/LABEL/METHOD/...` where there is a label."""
+    """Return metrics for the report as `clear/TABLES/METHOD/...`, or `clear/TABLES/LABEL/METHOD/...` with a label."""
     values: dict[str, Any] = {}
     for one in all_cleared:
         at = "/".join(filter(None, ("clear", one.tables, one.label, one.method)))
@@ -56,7 +58,7 @@ def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
 
 
 def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
-    """HTML with places for figures, and the figures by name."""
+    """Return HTML with places for figures, and the figures by name."""
     parts, figures = ["<h2>Clearing tables</h2>"], {}
     for tables in dict.fromkeys(one.tables for one in all_cleared):
         rows = [one for one in all_cleared if one.tables == tables]
@@ -92,14 +94,14 @@ def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> s
 
 
 def _cause(one: Cleared, entry: dict[str, Any]) -> str:
-    """Why a table ended, of CAUSES: an object leaves the workspace at a push or at a grasp."""
+    """Return why a table ended, one of CAUSES: an object can leave the workspace at a push or at a grasp."""
     ended = str(entry["ended"])
     grasped = ended == "pushed out" and str(film.load(one.folder / entry["file"]).what[-1]) != "push"
     return "thrown out" if grasped else ended
 
 
 def _tables_name(cases: str, objects: str) -> str:
-    """What a table of results is called: the hard instances, random-N, or a case file of the user's own."""
+    """Return the name of a table of results: the hard instances, random-N, or a case file of the user's own."""
     if cases in ("hard", "random"):
         return cases if cases == "hard" else f"random-{objects}"
     stem = pathlib.Path(cases).stem
@@ -107,7 +109,7 @@ def _tables_name(cases: str, objects: str) -> str:
 
 
 def _causes(rows: list[Cleared]) -> str:
-    """How every table ended, and on which cases it was not cleared."""
+    """Return an HTML table of how tables ended, and on which cases they were not cleared."""
     lines = []
     for one in rows:
         causes = [_cause(one, entry) for entry in one.episodes]
@@ -119,7 +121,7 @@ def _causes(rows: list[Cleared]) -> str:
 
 
 def course(one: Cleared, at: np.ndarray) -> np.ndarray:
-    """Share of objects that are left after `at [A]` actions an object, the mean over tables: `[A]`."""
+    """Return the share of objects left after `at [A]` actions per object, averaged over tables: `[A]`."""
     shares = []
     for entry in one.episodes:
         left = (film.load(one.folder / entry["file"]).shape >= 0).sum(1) / entry["objects"]
@@ -128,7 +130,7 @@ def course(one: Cleared, at: np.ndarray) -> np.ndarray:
 
 
 def _courses(rows: list[Cleared]) -> Any:
-    """How tables empty."""
+    """Plot the share of objects left against the number of actions."""
     figure, axis = plt.subplots(figsize=(6, 3.5))
     at = np.linspace(0, lockstep.ACTIONS_PER_OBJECT, 61)
     for one in rows:
@@ -141,7 +143,7 @@ def _courses(rows: list[Cleared]) -> Any:
 
 
 def _films(one: Cleared) -> Any:
-    """Filmstrips of the best, median and worst table, by how many objects an action removed."""
+    """Draw filmstrips of the best, median and worst table, by how many objects an action removed."""
 
     def quality(entry: dict[str, Any]) -> tuple[bool, float]:
         return entry["ended"] == "cleared", entry["removed"] / max(entry["grasps"] + entry["pushes"], 1)
@@ -171,7 +173,7 @@ def _draw(axis: Any, reel: film.Film, step: int) -> None:
 
 
 def _steps(all_cleared: list[Cleared]) -> Any:
-    """Some steps with what was predicted: pushes first, of whoever imagines."""
+    """Draw some steps with what was predicted, pushes first; methods that imagine images come first."""
     steps = []
     for one in sorted(all_cleared, key=lambda one: one.method != "dipn+gn"):
         for entry in one.episodes:

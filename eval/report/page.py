@@ -23,6 +23,7 @@ from ..clearing import sweeping
 from . import comparison
 
 FILM_ROWS = 4
+"""Number of pushes in the figure of predictions."""
 _STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:right}
 td:first-child,th:first-child{text-align:left}img{max-width:100%}h2{margin-top:2em}.note{color:#666}"""
@@ -30,7 +31,7 @@ td:first-child,th:first-child{text-align:left}img{max-width:100%}h2{margin-top:2
 
 @dataclasses.dataclass(frozen=True)
 class Sources:
-    """The folders that a report is made of."""
+    """The folders that a report is made from."""
 
     prediction: pathlib.Path | None = None  # of dipn-eval prediction
     grasp: pathlib.Path | None = None  # of dipn-eval grasp
@@ -40,7 +41,7 @@ class Sources:
 
 
 def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
-    """Write `report.html`, its pictures and `metrics.json` to a folder; returns the metrics of all sources.
+    """Write `report.html`, its pictures and `metrics.json` to a folder; return the metrics of all sources.
 
     Raises:
       UserError: there are no sources, or a folder lacks what its command writes.
@@ -62,7 +63,7 @@ def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
 
 
 def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, Any]]:
-    """Metrics, the sections as HTML with places for figures, and the figures by name."""
+    """Return the metrics, the sections as HTML with places for figures, and the figures by name."""
     values: dict[str, Any] = {}
     parts: list[str] = []
     figures: dict[str, Any] = {}

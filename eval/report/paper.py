@@ -1,9 +1,9 @@
-"""What Huang et al. (ICRA 2021) report of their own simulation, %: their table, to stand beside ours."""
+"""What Huang et al. (ICRA 2021) report of their own simulation, in per cent, to stand beside our results."""
 
 from __future__ import annotations
 
 COLUMNS = ("completion", "grasp_success_completed", "grasp_success_all", "efficiency_completed", "efficiency_all")
-"""In the order of the numbers below."""
+"""Metrics of the numbers below, in their order."""
 TABLE: dict[str, dict[str, tuple[float, ...]]] = {
     "random-30": {
         "vpg": (20.0, 69.0, 52.6, 66.3, 52.6),
@@ -18,3 +18,4 @@ TABLE: dict[str, dict[str, tuple[float, ...]]] = {
         "dipn+gn": (100.0, 93.3, 93.3, 74.4, 74.4),
     },
 }
+"""The paper's numbers by kind of tables and method."""

@@ -63,7 +63,7 @@ def test_a_gap_is_filled_with_the_same_bytes_and_the_rest_left_alone(copy: pathl
     assert records.verify(copy) == []
 
 
-def test_an_interruption_loses_at_most_the_shards_at_hand(
+def test_an_interruption_loses_at_most_the_unfinished_shards(
     copy: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "new"
@@ -105,12 +105,12 @@ def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
         generate(JOB, copy)
 
 
-def test_a_shard_does_not_depend_on_how_many_others_there_are(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
+def test_a_shard_does_not_depend_on_the_number_of_shards(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
     generate(dataclasses.replace(JOB, episodes=16), tmp_path / "short")
     assert shards.shard_path(tmp_path / "short", 0).read_bytes() == shards.shard_path(copy, 0).read_bytes()
 
 
-def test_every_distance_is_a_push_of_its_own_from_the_same_scene(tmp_path: pathlib.Path) -> None:
+def test_every_distance_gets_its_own_push_from_the_same_scene(tmp_path: pathlib.Path) -> None:
     generate(dataclasses.replace(JOB, episodes=12, shard_size=12, distances=(0.03, 0.1)), tmp_path / "sweep")
     episodes, _ = records.load(tmp_path / "sweep", kind="push")
     short, long = (structs.take(episodes, slice(i, None, 2)) for i in (0, 1))
@@ -121,7 +121,7 @@ def test_every_distance_is_a_push_of_its_own_from_the_same_scene(tmp_path: pathl
     assert (shift[0] < shift[1])[shift[1] > 0.04].all() and (shift[1] > 0.04).any()
 
 
-def test_nonsense_is_refused(tmp_path: pathlib.Path) -> None:
+def test_invalid_options_are_refused(tmp_path: pathlib.Path) -> None:
     for change in ({"episodes": -1}, {"shard_size": 0}, {"actions": 0}):
         with pytest.raises(UserError, match=r"want a number above 0|want 1 to 256"):
             dataclasses.replace(JOB, **change)

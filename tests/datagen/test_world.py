@@ -1,4 +1,4 @@
-"""The figures of a right world, on few scenes; and the page that shows them."""
+"""The figures of a correct world on few scenes, and the page that shows them."""
 
 import json
 import pathlib
@@ -24,7 +24,7 @@ def trial(settled: Any) -> world.Trial:
     return world.Trial(settled, pushes, episodes.aim_grasps(keys, settled.scene, settled.poses, actions=2))
 
 
-def test_an_engine_agrees_with_itself_and_a_turn_is_seen(engine: Any, trial: world.Trial) -> None:
+def test_an_engine_agrees_with_itself_and_a_turn_is_measured(engine: Any, trial: world.Trial) -> None:
     counted, poses = world.pushes(engine, trial)
     assert counted["push/moved_objects"] > 2 and 0 <= counted["push/tipped_of_moved"] < 1
     held = world.held_by(engine, trial)
@@ -39,7 +39,7 @@ def test_an_engine_agrees_with_itself_and_a_turn_is_seen(engine: Any, trial: wor
     assert abs(turned["agreement/native/10cm/p50_deg"] - 90) < 0.2
 
 
-def test_a_push_of_its_own_ends_near_the_same_centimetre_of_a_longer_one(engine: Any, trial: world.Trial) -> None:
+def test_a_short_push_ends_near_the_same_centimetre_of_a_longer_one(engine: Any, trial: world.Trial) -> None:
     _, poses = world.pushes(engine, trial)
     found = world.sweep(engine, trial, poses)
     assert 0 < found["sweep/5cm/p50_mm"] < 2

@@ -1,4 +1,4 @@
-"""Shared by the tests of evaluations: networks that have learnt nothing, and tables that they cleared."""
+"""Fixtures for the tests of evaluations: networks with random weights, and tables that they acted on."""
 
 import copy
 import pathlib
@@ -19,7 +19,7 @@ from dipn_jax.world import cases
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
-    """Networks that have learnt nothing."""
+    """Return runs of networks with random weights."""
     folder = tmp_path_factory.mktemp("runs")
     for name, config in (("dipn", DipnConfig(width=8)), ("grasp", GraspConfig(width=8))):
         model = checkpoint.build(name, config)
@@ -30,7 +30,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
 
 @pytest.fixture(scope="session")
 def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Two hard cases acted on by networks that know nothing: one by grasps, one by pushes."""
+    """Return two hard cases on which networks with random weights acted: one by grasps, one by pushes."""
     out = tmp_path_factory.mktemp("clear")
     networks = Networks(push=runs["dipn"], grasp=runs["grasp"])
 

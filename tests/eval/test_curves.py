@@ -1,4 +1,4 @@
-"""Learning curves: which run is which, the arithmetic of the band, and the page in docs."""
+"""Learning curves: how runs are grouped, the arithmetic of the band, and the page in docs."""
 
 import json
 import pathlib
@@ -22,7 +22,7 @@ def _push_run(folder: pathlib.Path, extra: dict[str, int]) -> pathlib.Path:
     return folder
 
 
-def test_runs_are_told_apart_by_pushes_and_seed(tmp_path: pathlib.Path) -> None:
+def test_runs_are_distinguished_by_pushes_and_seed(tmp_path: pathlib.Path) -> None:
     runs = [_push_run(tmp_path / str(n), {"examples": n, "seed": 1}) for n in (1500, 100)]
     assert list(curves.load_push_runs(runs)) == ["100/1", "1500/1"]
     with pytest.raises(UserError, match="a second run of 100 pushes with seed 1"):

@@ -1,4 +1,4 @@
-"""The experiments themselves: every command is one that the real command takes."""
+"""The lists of runs: every command is accepted by its own parser."""
 
 import pathlib
 from types import ModuleType
@@ -8,13 +8,13 @@ import pytest
 from experiments import clearing, demo, grasping, push_prediction, runs
 
 COUNTS = {demo: 11, push_prediction: 52, grasping: 31, clearing: 41}
-"""Runs of each experiment."""
+"""Number of runs of each experiment."""
 
 each = pytest.mark.parametrize("experiment", COUNTS, ids=lambda module: module.__name__.rpartition(".")[2])
 
 
 @each
-def test_a_dry_run_takes_every_command_and_makes_nothing(
+def test_a_dry_run_parses_every_command_and_writes_nothing(
     experiment: ModuleType, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert experiment.main(["--dry-run", "--out", str(tmp_path / "out")]) == 0
@@ -37,7 +37,9 @@ def test_every_folder_that_a_run_reads_is_written_before(experiment: ModuleType)
 
 
 @each
-def test_a_list_and_a_name_that_is_none(experiment: ModuleType, capfd: pytest.CaptureFixture[str]) -> None:
+def test_runs_are_listed_and_an_unknown_name_is_refused(
+    experiment: ModuleType, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert experiment.main(["--list"]) == 0
     assert capfd.readouterr().out.count("\n  dipn-") == COUNTS[experiment]
     assert experiment.main(["--only", "nothing"]) == 2

@@ -1,4 +1,4 @@
-"""The pages of results show the figures in docs, and are written from results of runs."""
+"""The pages of results show the figures in docs, and are written from the results of runs."""
 
 import pathlib
 import shutil
@@ -41,7 +41,7 @@ FACTS = {
 }
 
 
-def test_a_box_says_who_made_what_and_what_is_not_known() -> None:
+def test_a_box_lists_machines_and_commits_and_what_is_not_recorded() -> None:
     assert pages.box({"a": 1, "b": 2, "made": FACTS}) == (
         "```\n"
         "figures: 2\n"
@@ -80,7 +80,7 @@ def test_a_table_and_a_box_have_one_place() -> None:
 
 @pytest.fixture
 def docs(tmp_path: pathlib.Path) -> pathlib.Path:
-    """A copy of the pages to write to, without their figures."""
+    """Return a copy of the pages to write to, without their figures."""
     copy = tmp_path / "docs"
     copy.mkdir()
     for name in PAGES:
@@ -99,7 +99,7 @@ def _under(values: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _unchanged(docs: pathlib.Path, name: str, values: dict[str, Any]) -> None:
-    """The page is as it was but for its box, and so is the JSON but for how it was made."""
+    """Check that only the box of a page has changed, and in its JSON only how it was made."""
     written = files.read_json(docs / f"{name}.json")
     made = written.pop("made")
     assert written == values

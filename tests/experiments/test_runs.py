@@ -1,4 +1,4 @@
-"""Lists of runs: order, what is skipped, what is made again, interruptions, the command line."""
+"""Lists of runs: their order, which are skipped or made again, interruptions, the command line."""
 
 import os
 import pathlib
@@ -24,19 +24,19 @@ if (out.parent / f"break-{out.name}").exists():
     sys.exit(3)
 (out / "config.json").write_text(json.dumps({"seed": 7}))
 """
-"""A command that writes its folder's name in a log, and fails where a file says so."""
+"""A command that logs its folder's name, and fails if a file tells it to."""
 
 
 @pytest.fixture
 def fake(tmp_path: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
-    """Python and a script: the first words of a command."""
+    """Return the first words of a command: Python and a script."""
     script = tmp_path / "fake.py"
     script.write_text(FAKE)
     return pathlib.Path(sys.executable), script
 
 
 def _listed(fake: tuple[pathlib.Path, ...], folder: pathlib.Path, *, option: str = "--steps 1") -> list[Run]:
-    """Runs a to d: b needs a, c needs b, d needs nothing."""
+    """Return runs a to d: b needs a, c needs b, d needs nothing."""
     run = Recipe(folder)
     a = run("a", *fake, option)
     b = run("b", *fake, "--data", a)
@@ -49,7 +49,7 @@ def _carry_out(listed: list[Run]) -> int:
     return runs.carry_out(listed, runs.keys(listed))
 
 
-def test_what_failed_is_tried_again_and_what_is_complete_is_not(fake, tmp_path: pathlib.Path, capfd) -> None:
+def test_a_failed_run_is_made_again_and_a_complete_one_is_not(fake, tmp_path: pathlib.Path, capfd) -> None:
     listed = _listed(fake, tmp_path)
     (tmp_path / "break-b").touch()
     assert _carry_out(listed) == 3
@@ -66,13 +66,13 @@ def test_what_failed_is_tried_again_and_what_is_complete_is_not(fake, tmp_path: 
     assert (tmp_path / "log").read_text() == "a b b c d "
 
 
-def test_a_changed_command_and_what_needs_it_are_made_again(fake, tmp_path: pathlib.Path) -> None:
+def test_a_changed_command_and_the_runs_that_need_it_are_made_again(fake, tmp_path: pathlib.Path) -> None:
     assert _carry_out(_listed(fake, tmp_path)) == 0
     assert _carry_out(_listed(fake, tmp_path, option="--steps 2")) == 0
     assert (tmp_path / "log").read_text() == "a b c d a b c "
 
 
-def test_a_run_brings_along_what_it_needs(fake, tmp_path: pathlib.Path) -> None:
+def test_a_selected_run_includes_the_runs_that_it_needs(fake, tmp_path: pathlib.Path) -> None:
     listed = _listed(fake, tmp_path)
     assert [run.name for run in runs.select(listed, ["c"])] == ["a", "b", "c"]
     assert [run.name for run in runs.select(listed, ["d", "a"])] == ["a", "d"]
@@ -89,7 +89,7 @@ def test_a_borrowed_run_is_the_same_run(fake, tmp_path: pathlib.Path) -> None:
     assert runs.keys(run.runs)["first/b"] == runs.keys(listed)["b"]
 
 
-def test_a_stamp_says_who_made_it(fake, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stamp_names_machine_and_commit(fake, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (run,) = _listed(fake, tmp_path)[:1]
     monkeypatch.setattr(machine, "commit", lambda: "abc")
     (tmp_path / "break-a").touch()
@@ -113,7 +113,7 @@ def test_paths_stay_whole_and_texts_are_split() -> None:
     assert runs.words(["x --of 2", place, [place, place]]) == ("x", "--of", "2", *3 * ["a folder"])
 
 
-def test_arguments_that_a_command_does_not_take(tmp_path: pathlib.Path) -> None:
+def test_unknown_arguments_of_a_command_are_refused(tmp_path: pathlib.Path) -> None:
     run = Recipe(tmp_path)
     run("good", "dipn-datagen push --episodes 5 --density 100 200")
     run("bad", "dipn-datagen push --bananas 5")
@@ -165,7 +165,7 @@ for _ in range(600):
 (out / "saved").write_text(str(interruptions))
 sys.exit(130)
 """
-"""A command that works for half a minute and saves its state, and how often it was interrupted."""
+"""A command that works for half a minute and saves its state and how often it was interrupted."""
 
 MAIN = """
 import pathlib, sys

@@ -1,4 +1,4 @@
-"""The type checker that the import hook puts on every function of the library in tests: beartype, for shapes alone.
+"""The type checker that the import hook applies to every function of the library in tests: beartype, for shapes only.
 
 Only annotations that say a shape are looked at (`Float[Array, "N 3"]`, or a struct that has such fields); what else a
 function is given, mypy and the tests of its errors see to. Three things that beartype alone does not do:
@@ -33,15 +33,15 @@ class _Kind(type):
 
 
 class AnArray(metaclass=_Kind):
-    """Any array, of JAX or of NumPy."""
+    """Any array of JAX or NumPy."""
 
 
 class NoArray(metaclass=_Kind):
-    """Anything else."""
+    """Anything that is not an array."""
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` with the shapes of its arguments and of its result checked on every call."""
+    """Return `function` with a check of the shapes of its arguments and result on every call."""
     hints = function.__annotations__
     structs = [name for name, hint in hints.items() if name != "return" and any(map(_is_struct, _parts(hint)))]
     shaped = {name: _of_any_array(hint) for name, hint in hints.items() if _says_shape(hint)}
@@ -76,13 +76,13 @@ def _check_fields(struct: Any, place: str) -> None:
 
 @functools.cache
 def _fields(struct: type) -> list[tuple[str, Any]]:
-    """Fields and their types, any batch axes allowed."""
+    """Return the fields and their types, with any batch axes."""
     hints = typing.get_type_hints(struct, include_extras=True)
     return [(field.name, _of_any_array(hints[field.name], batch="...")) for field in dataclasses.fields(struct)]
 
 
 def _of_any_array(hint: Any, *, batch: str = "*b") -> Any:
-    """The same type for arrays of any kind, with `batch` for the batch axes."""
+    """Return the same type for arrays of any kind, with `batch` as the batch axes."""
     if _is_array(hint):
         return hint.dtype[AnArray, hint.dim_str.replace("*b", batch)]
     if not _says_shape(hint):
@@ -106,5 +106,5 @@ def _is_struct(hint: Any) -> bool:
 
 
 def _says_shape(hint: Any) -> bool:
-    """Whether there is an array of a given shape anywhere in a type."""
+    """Return whether a type contains an array of a given shape."""
     return _is_array(hint) or any(_says_shape(part) for part in typing.get_args(hint))

@@ -1,4 +1,4 @@
-"""The compared methods: rewards, targets, tables, and whether a run learns and goes on."""
+"""The compared methods: rewards, targets, tables, training, and interruptions of it."""
 
 import pathlib
 from typing import Any
@@ -29,7 +29,7 @@ def _look(height: np.ndarray, grasp_value: float) -> Look:
 
 
 def _heights(*pixels: int) -> np.ndarray:
-    """Maps with so many pixels of an object."""
+    """Return maps with the given numbers of pixels of an object."""
     maps = np.zeros((len(pixels), 224 * 224))
     for row, count in zip(maps, pixels, strict=True):
         row[:count] = 0.05
@@ -41,7 +41,7 @@ def test_a_push_is_rewarded_for_change() -> None:
     np.testing.assert_array_equal(acting.push_reward(now, then, method="vpg"), [0.0, 0.5])
 
 
-def test_dqns_push_is_rewarded_for_a_better_grasp_and_for_what_it_uncovers() -> None:
+def test_dqns_push_is_rewarded_for_a_better_grasp_and_for_uncovering() -> None:
     now = _look(_heights(1000, 1000, 1000, 1000), 0.5)
     then = _look(_heights(1000, 1000, 1400, 600), 0.8)
     then.height[1] = np.roll(then.height[1], 1000)
@@ -58,7 +58,7 @@ def test_a_target_has_the_value_of_the_best_next_action_but_no_impossible_one() 
     np.testing.assert_allclose(target, [1.4, 1.1, 1.5, 0.0])
 
 
-def test_tables_that_are_done_with_are_set_anew(engine: Any) -> None:
+def test_finished_tables_are_set_anew(engine: Any) -> None:
     played = tables.begin(engine, CONFIG, count=4, seed=0)
     scene, poses = jax.tree.map(np.array, played.scene), played.poses.copy()
     scene.shape[0] = -1  # cleared
@@ -81,12 +81,12 @@ def test_exploration_fades_and_reactive_grasps_never_push() -> None:
 
 
 def _flat_scores(images: jax.Array) -> jax.Array:
-    """A GN that likes objects more the higher they are."""
+    """Return scores like those of a GN that prefers higher objects."""
     return jnp.tile(images[:, None, ..., 3], (1, 16, 1, 1))
 
 
 @pytest.mark.parametrize("method", ["vpg", "rea", "dqn"])
-def test_a_run_that_was_interrupted_goes_on_to_the_same_end(
+def test_an_interrupted_run_continues_to_the_same_end(
     method: Any, engine: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = baseline.BaselineConfig(method, actions=8, tables=4, updates=2, batch=4)
@@ -122,8 +122,8 @@ def test_a_run_that_was_interrupted_goes_on_to_the_same_end(
 
 
 @pytest.mark.slow
-def test_the_published_form_looks_and_learns(engine: Any) -> None:
-    """Traced, not compiled."""
+def test_the_published_form_takes_a_training_step(engine: Any) -> None:
+    """It is traced, not compiled."""
     import functools
 
     import optax
@@ -152,7 +152,7 @@ def test_the_published_form_looks_and_learns(engine: Any) -> None:
 
 
 def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
-    """A network fits two outcomes that differ in nothing but where they were tried."""
+    """A network fits two outcomes that differ only in the executed pixel."""
     import optax
     from dipn_jax.train.grasp import SHIFT_PIXELS, WINDOW_PIXELS, windows
     from dipn_jax.train.loop import make_step

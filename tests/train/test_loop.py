@@ -47,7 +47,7 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(
         nonlocal calls
         calls += 1
         if calls == 4:
-            os.kill(os.getpid(), signal.SIGTERM)  # the step at hand is finished first
+            os.kill(os.getpid(), signal.SIGTERM)  # the current step is finished first
         return fetch(index)
 
     monkeypatch.setattr(task, "fetch", interrupt)
@@ -71,15 +71,15 @@ def test_a_folder_belongs_to_one_run(task: PushTask, tmp_path: pathlib.Path) -> 
 
 
 def _loss(task: Any, model: nnx.Module, count: int) -> float:
-    """Loss on the first `count` training examples."""
+    """Return the loss on the first `count` training examples."""
     graph, state = nnx.split(model)
     batch = task.fetch(np.arange(count))
     return float(jax.jit(lambda s: task.loss(nnx.merge(graph, s), batch, jax.random.key(5)))(state))
 
 
 @pytest.mark.slow
-def test_dipn_learns_what_it_is_shown(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
-    """A hundred and twenty steps on 22 pushes: the loss on them halves, for real."""
+def test_dipn_fits_its_training_data(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    """The loss on 22 pushes halves in 120 real steps."""
     task = PushTask(data["push"], SMALL, limit=None, centimetres=(10,))
     fit(task, TrainConfig(steps=120, batch=8, learning_rate=3e-3, eval_every=1000, save_every=1000), tmp_path)
     trained = checkpoint.load_network(tmp_path, network="dipn")
@@ -87,8 +87,8 @@ def test_dipn_learns_what_it_is_shown(data: dict[str, pathlib.Path], tmp_path: p
 
 
 @pytest.mark.slow
-def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
-    """Pre-training on three scenes, then 21 grasps: each loss falls below the entropy of its labels."""
+def test_grasp_tasks_fit_their_training_data(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    """After pre-training on three scenes and training on 21 grasps each loss is below the entropy of its labels."""
     config = GraspConfig(width=8)
     pretrain = PretrainTask(data["images"], config)
     first = fit(
@@ -106,7 +106,7 @@ def test_grasp_tasks_learn_what_they_are_shown(data: dict[str, pathlib.Path], tm
 
 
 @pytest.mark.slow
-def test_learning_online_goes_on_where_it_was_stopped(engine: Any, tmp_path: pathlib.Path) -> None:
+def test_learning_online_continues_where_it_was_stopped(engine: Any, tmp_path: pathlib.Path) -> None:
     plan = online.OnlineConfig(grasps=6, tables=2, updates=2, batch=4)
     network = GraspConfig(width=8, coarse=8, blocks=1)
     scene = scenes.fixed_count(3, spread=0.2)
@@ -155,8 +155,8 @@ def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Pat
 
 
 @pytest.mark.slow
-def test_the_published_networks_take_their_tasks(data: dict[str, pathlib.Path]) -> None:
-    """A whole step is traced, not compiled: the published forms learn in tests/dipn_jax/test_networks.py."""
+def test_the_published_networks_take_a_training_step(data: dict[str, pathlib.Path]) -> None:
+    """Traced, not compiled; the networks themselves are trained in the tests of networks."""
     dipn, gn = DipnConfig(preset="paper"), GraspConfig(preset="paper")
     tasks = (
         PushTask(data["push"], dipn, limit=None, centimetres=(5, 10)),
@@ -188,7 +188,7 @@ def test_no_scene_is_on_both_sides_of_the_split(data: dict[str, pathlib.Path]) -
     assert not seen[0] & seen[1] and seen[1]
 
 
-def test_an_example_is_what_the_camera_shows_and_the_push_does(task: PushTask) -> None:
+def test_an_example_is_the_rendered_scene_and_the_motion_of_the_push(task: PushTask) -> None:
     index = np.array([3, 0])
     kept, fresh = task.fetch(index), task.prepare(structs.take(task.train_set, index))
     np.testing.assert_allclose(kept.inputs.crops, fresh.inputs.crops, atol=1e-3)  # kept in half precision
@@ -205,7 +205,7 @@ def test_an_example_is_what_the_camera_shows_and_the_push_does(task: PushTask) -
     assert kept.taught.all()
 
 
-def test_masks_found_in_the_image_teach_the_same_of_the_same_objects(
+def test_masks_found_in_the_image_give_the_same_targets_for_the_same_objects(
     task: PushTask, data: dict[str, pathlib.Path]
 ) -> None:
     found = PushTask(data["push"], SMALL, limit=None, centimetres=(5, 10), found=True)
@@ -219,7 +219,7 @@ def test_masks_found_in_the_image_teach_the_same_of_the_same_objects(
     assert np.abs(here.inputs.centers - there.inputs.centers)[both].max() < 0.05
 
 
-def test_nonsense_is_refused(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+def test_invalid_options_are_refused(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
     with pytest.raises(UserError, match="--centimetres"):
         PushTask(data["push"], SMALL, limit=None, centimetres=(0, 5))
     with pytest.raises(UserError, match="--limit 1000"):

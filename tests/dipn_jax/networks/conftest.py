@@ -1,4 +1,4 @@
-"""Shared by the tests of networks."""
+"""Fixtures for the tests of networks."""
 
 from typing import Any
 
@@ -10,12 +10,12 @@ from flax import nnx
 
 @pytest.fixture
 def one_step() -> Any:
-    """(model, loss) -> the loss before and after one step of gradient descent."""
+    """Return a function of model and loss that returns the loss before and after one step of gradient descent."""
     return _one_step
 
 
 def _one_step(model: Any, loss: Any) -> tuple[float, float]:
-    """Loss before and after one step of gradient descent."""
+    """Return the loss before and after one step of gradient descent."""
     optimizer = nnx.Optimizer(model, optax.sgd(1e-4), wrt=nnx.Param)
 
     @nnx.jit

@@ -138,7 +138,7 @@ def test_batch_elements_do_not_interact(forward: Any, inputs: PushInput) -> None
     np.testing.assert_allclose(forward(changed)[1:], forward(inputs)[1:], atol=1e-5)
 
 
-def test_the_published_form_is_as_blind_to_order_padding_and_neighbours(settled: Any) -> None:
+def test_the_published_form_does_not_depend_on_order_padding_and_neighbours(settled: Any) -> None:
     network = dipn.DIPN(dipn.DipnConfig(preset="paper", stages=(1, 1, 1, 1)), rngs=nnx.Rngs(0))
     network.eval()
     graph, state = nnx.split(network)
@@ -184,7 +184,7 @@ def test_the_mirror_of_a_push_has_the_mirrored_outcome(network: dipn.DIPN, input
     np.testing.assert_allclose(answer(push_frame.mirror(inputs)), push_frame.mirror_motion(there), atol=1e-4)
 
 
-def test_a_distance_does_not_depend_on_which_others_are_asked(forward: Any, inputs: PushInput) -> None:
+def test_the_prediction_at_a_distance_does_not_depend_on_the_other_distances(forward: Any, inputs: PushInput) -> None:
     several = forward(inputs)
     reversed_ = forward(inputs, DISTANCES[:, ::-1])
     np.testing.assert_allclose(several, reversed_[:, :, ::-1], atol=1e-5)

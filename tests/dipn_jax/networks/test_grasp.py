@@ -12,7 +12,7 @@ from dipn_jax.sight import render
 from dipn_jax.workspace import grasp_angles
 
 
-def test_compact_grasp_scores_are_of_the_pixel_they_stand_at() -> None:
+def test_compact_grasp_scores_belong_to_their_own_pixel() -> None:
     # the score map of a turned image is the turned score map
     model = grasp.GraspNet(grasp.GraspConfig(), rngs=nnx.Rngs(0))
     model.eval()

@@ -1,4 +1,4 @@
-"""The fast look at imagined images against scoring every one of them whole."""
+"""The fast scores of imagined images, compared with those of whole images."""
 
 import pathlib
 from typing import Any

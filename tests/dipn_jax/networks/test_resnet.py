@@ -1,4 +1,4 @@
-"""Convolutions and pooling written for speed, against Flax's."""
+"""Convolutions and pooling written for speed, compared with Flax's."""
 
 from __future__ import annotations
 

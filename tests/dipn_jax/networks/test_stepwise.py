@@ -9,7 +9,7 @@ from dipn_jax.sight import masks, render
 from dipn_jax.workspace import GRIPPER
 
 
-def test_outlines_are_how_far_the_pixels_reach(settled: Any) -> None:
+def test_outlines_are_the_extents_of_the_pixels(settled: Any) -> None:
     height, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     centers, _ = masks.mask_centers(label, 5)
     got = np.asarray(push_frame.outlines(label, height, jnp.float32(0.4), centers))
@@ -25,7 +25,7 @@ def test_outlines_are_how_far_the_pixels_reach(settled: Any) -> None:
 
 
 def _box(half: tuple[float, float], angle: float) -> np.ndarray:
-    """Support function of a box about its middle."""
+    """Return the support function of a box about its middle."""
     c, s = np.cos(angle), np.sin(angle)
     own = push_frame.directions() @ np.array([[c, -s], [s, c]])  # directions as the box sees them
     return (np.abs(own) @ np.array(half)).astype(np.float32)

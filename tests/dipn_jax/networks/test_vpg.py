@@ -1,4 +1,4 @@
-"""The compared methods' networks."""
+"""The networks of the compared methods."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ def test_a_trunk_is_densenet_121() -> None:
     assert out.shape == (1, 2, 2, 1024) and trunk.features == 1024
 
 
-def test_the_published_form_has_two_trunks_a_primitive_and_answers_every_pixel() -> None:
+def test_the_published_form_has_two_trunks_per_primitive_and_scores_every_pixel() -> None:
     model = nnx.eval_shape(lambda: checkpoint.build("vpg", VpgConfig(preset="paper")))
     heads = 2 * (2 * 2048 + 2048 * 64 + 2 * 64 + 64)
     assert _parameters(model) == 4 * 6_953_856 + heads
@@ -44,7 +44,7 @@ def test_pushes_have_sixteen_directions_and_grasps_eight() -> None:
     assert (grasp[:, on_table] == 0).all() and (push[:, on_table] != 0).any(), "a push begins beside an object"
 
 
-def test_a_part_that_was_not_learnt_is_none_and_nonsense_is_refused() -> None:
+def test_a_part_without_training_is_none_and_invalid_options_are_refused() -> None:
     model = checkpoint.build("vpg", VpgConfig(parts=("grasp",), answers="chance", width=8, coarse=8))
     pushes, grasps = scorers.value_scorers(model)  # type: ignore[arg-type]
     assert pushes is None and grasps is not None

@@ -1,4 +1,4 @@
-"""The solver for elliptic cones against SciPy, on the cost as MuJoCo's documentation has it."""
+"""The solver for elliptic cones compared with SciPy, on the cost that MuJoCo's documentation gives."""
 
 from typing import Any
 
@@ -9,11 +9,16 @@ import scipy.optimize
 
 from dipn_jax.physics import cone
 
-V, ROWS, CONES = 9, 3, 4
+V = 9
+"""Degrees of freedom."""
+ROWS = 3
+"""Quadratic rows."""
+CONES = 4
+"""Contacts."""
 
 
 def _problem(rng: np.random.Generator, *, sticking: bool) -> cone._Problem:
-    """Random bodies, masses a thousandfold apart; where they stick, the free acceleration is tangential."""
+    """Make random bodies with masses a thousandfold apart; where they stick, the free acceleration is tangential."""
     spread = 10 ** rng.uniform(-1.5, 1.5, V)
     basis = rng.normal(size=(V, V))
     mass = (basis @ basis.T / V + np.eye(V)) * np.sqrt(spread[:, None] * spread)
@@ -36,7 +41,7 @@ def _problem(rng: np.random.Generator, *, sticking: bool) -> cone._Problem:
 
 
 def _cost(p: Any, a: np.ndarray) -> float:
-    """Quadratic rows, and for each contact the zones top (free), bottom (quadratic) and middle (cone)."""
+    """Return the cost of quadratic rows, and of each contact by zone: top (free), bottom (quadratic), middle (cone)."""
     x = p.rows @ a - p.goal
     total = (a - p.free) @ p.mass @ (a - p.free) / 2 + (np.where(p.always | (x < 0), p.weight, 0) * x**2).sum() / 2
     for i in range(CONES):

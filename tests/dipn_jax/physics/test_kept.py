@@ -1,4 +1,4 @@
-"""Traces on disk."""
+"""Traced programs kept on disk."""
 
 import pathlib
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""MJX against MuJoCo C: the same contacts, the same episodes, one program for everything."""
+"""MJX compared with MuJoCo C: the same contacts, the same episodes, one program for everything."""
 
 from __future__ import annotations
 
@@ -24,12 +24,15 @@ from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import model, primitives, scenes, shapes
 
-BATCH, SLOTS = 4, 3
+BATCH = 4
+"""Scenes that the program takes."""
+SLOTS = 3
+"""Object slots of a scene."""
 POSITION_TOLERANCE = 0.003
 """Metres between the engines after 5 cm of a push: float32 and another solver. On 32 random scenes (docs/world.md) the
 90th percentile is 1.3 mm, as contacts between objects multiply differences."""
 DEPTH_TOLERANCE = 1e-4
-"""Metres of contact depth; 0.05 mm of it is `colliders.FACE_PREFERENCE`. Measured: 1e-8 on these pairs."""
+"""Metres of contact depth; `colliders.FACE_PREFERENCE` is 0.05 mm of it. Measured: 1e-8 on these pairs."""
 DEEPEST = 0.003
 """Metres: deeper than any contact of an episode. Far deeper, clipping a face can cut off the deepest corner."""
 CLASS = {name: i for i, name in enumerate(shapes.CLASSES)}
@@ -48,7 +51,7 @@ LINES = (
 )
 
 
-DEVICES = """
+FOUR_DEVICES = """
 import jax, numpy as np
 from dipn_jax import console
 from dipn_jax.world import primitives, scenes
@@ -62,12 +65,12 @@ found, wanted = (primitives.settle(e, scene, poses, duration=0.1, fence=0.1) for
 np.testing.assert_allclose(found.poses, wanted.poses, atol=1e-6)
 np.testing.assert_array_equal(found.fault, wanted.fault)
 """
-"""Run with four virtual devices: each simulates two of eight scenes of one object."""
+"""A script for four virtual devices, each of which simulates two of eight scenes of one object."""
 
 
 @pytest.fixture(scope="session")
 def engine() -> MjxEngine:
-    """One engine for the file: its only program takes most of the time."""
+    """Return one engine for the whole file: compiling its only program takes most of the time."""
     return MjxEngine()
 
 
@@ -77,7 +80,7 @@ def reference(engine: MjxEngine) -> NativeEngine:
 
 
 def _lines() -> tuple[Scene, np.ndarray]:
-    """Four scenes, each objects in a row along y, a little above the table."""
+    """Return four scenes, each with objects in a row along y, a little above the table."""
     shape = np.array([[ABSENT if name is None else CLASS[name] for name in line] for line in LINES], np.int32)
     size = np.array([[SIZES[name or "cuboid"] for name in line] for line in LINES], np.float32)
     mass = np.where(shape >= 0, 500 * shapes.volume(shape, size), 0.1).astype(np.float32)
@@ -98,7 +101,7 @@ def settled(reference: NativeEngine) -> tuple[Scene, np.ndarray]:
 
 @pytest.fixture(scope="session")
 def pushed(engine: MjxEngine, settled: tuple[Scene, np.ndarray]) -> tuple[Push, Any]:
-    """A push of the middle object along x, which grazes no other; also what compiles the program."""
+    """Push the middle object along x without touching another; this also compiles the program."""
     scene, poses = settled
     start = jnp.asarray(poses[:, 1, :2] - np.array([0.055, 0.0]), jnp.float32)
     push = Push(start, jnp.zeros(BATCH), jnp.full(BATCH, 0.1))
@@ -208,7 +211,7 @@ def test_a_fence_pushes_as_in_mujoco_c(
 
 def test_a_batch_is_shared_by_all_devices_with_equal_results(tmp_path: pathlib.Path) -> None:
     script = tmp_path / "devices.py"
-    script.write_text(DEVICES)
+    script.write_text(FOUR_DEVICES)
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, script], env=os.environ | flags, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -240,7 +243,7 @@ def test_a_timestep_that_does_not_divide_the_control_period_is_refused() -> None
 
 
 def _random_pairs(count: int) -> tuple[Scene, np.ndarray]:
-    """Pairs of objects of all classes that overlap a little or nearly; the first one also cuts the table."""
+    """Return pairs of objects of all classes that overlap a little or nearly; the first also cuts the table."""
     keys = jax.random.split(jax.random.key(0), 3)
     shape = np.stack([np.arange(count) % 5, (np.arange(count) // 5) % 5], -1).astype(np.int32)
     size = np.array([[SIZES[shapes.CLASSES[c]] for c in row] for row in shape], np.float32)
@@ -255,7 +258,7 @@ def _random_pairs(count: int) -> tuple[Scene, np.ndarray]:
 
 @jax.jit
 def _depths(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Least distance between parts `[B, P, P]` (1: apart) and of parts to the table `[B, P]` of the first object."""
+    """Return least distances between parts `[B, P, P]` (1: apart) and of the first object's parts to the table."""
     parts = jax.vmap(jax.vmap(prisms.parts))(scene.shape, scene.size)
     turn = geometry.quat_to_matrix(poses[..., 3:])
     pos = poses[..., None, :3] + jnp.einsum("bnij,bnpj->bnpi", turn, parts.center)

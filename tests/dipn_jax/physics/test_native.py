@@ -1,4 +1,4 @@
-"""The C engine and the primitives on it."""
+"""The C engine, and the primitives executed on it."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from dipn_jax.world import clutter, model, primitives, scenes, shapes
 
 
 def one_of_each(slots: int = 2) -> tuple[Scene, np.ndarray]:
-    """Five scenes, each one object of another class at rest in the middle, the other slots empty."""
+    """Return five scenes, each with one object of another class at rest in the middle and the other slots empty."""
     count = len(shapes.CLASSES)
     shape = np.full((count, slots), -1, np.int32)
     shape[:, 0] = np.arange(count)
@@ -57,7 +57,7 @@ def test_every_class_comes_to_rest_on_the_table(resting: Any) -> None:
         assert abs(corners[:, 2].min()) < 5e-4
 
 
-def test_a_push_moves_what_it_meets_as_far_as_it_goes(engine: Any, resting: Any) -> None:
+def test_a_push_moves_the_object_by_its_remaining_length(engine: Any, resting: Any) -> None:
     scene, poses = resting
     rollout = primitives.push(engine, scene, poses, _pushes(5))
     assert rollout.poses.shape == (5, 12, 2, 7)
@@ -133,7 +133,7 @@ def test_a_spike_of_speed_and_an_object_inside_another_are_faults(engine: Any, r
 
 
 @pytest.mark.parametrize(("fence", "fault"), [(0.0, Fault.PENETRATION), (0.6, 0)])
-def test_a_contact_that_was_deep_on_the_way_is_a_fault_but_for_heaps_that_fall_and_at_the_start(
+def test_a_deep_contact_on_the_way_is_a_fault_except_in_falling_heaps_and_at_the_start(
     engine: Any, resting: Any, fence: float, fault: int
 ) -> None:
     scene, poses = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 3, 0), resting)
@@ -145,7 +145,7 @@ def test_a_contact_that_was_deep_on_the_way_is_a_fault_but_for_heaps_that_fall_a
     assert np.abs(found.poses[2, 0, 1, 0] - found.poses[2, 0, 0, 0]) > 0.0495  # pushed apart
 
 
-def test_what_is_inside_another_stays_a_fault_when_it_sleeps(engine: Any) -> None:
+def test_an_object_inside_another_stays_a_fault_when_it_sleeps(engine: Any) -> None:
     size, flat = np.full((1, 2, 3), 0.05, np.float32), np.full((1, 2), 0.35, np.float32)
     cubes = Scene(np.zeros((1, 2), np.int32), size, size, flat / 7, flat)
     poses = np.zeros((1, 2, 7), np.float32)
@@ -159,7 +159,7 @@ def test_what_is_inside_another_stays_a_fault_when_it_sleeps(engine: Any) -> Non
     assert native.contact_depths(models, qpos)[0] > 0.009
 
 
-def test_what_is_not_finite_is_a_fault_of_its_own_episode(engine: Any, resting: Any) -> None:
+def test_a_position_that_is_not_finite_is_a_fault_of_its_own_episode(engine: Any, resting: Any) -> None:
     scene, poses = resting
     bad = np.array(poses)
     bad[1, 0, 2] = np.nan
@@ -179,7 +179,7 @@ def test_lack_of_room_is_a_fault(engine: Any, resting: Any, monkeypatch: pytest.
     assert (cramped.fault == Fault.CAPACITY).all()
 
 
-def test_a_diverged_simulation_is_not_reset_behind_our_back(resting: Any) -> None:
+def test_a_diverged_simulation_is_not_reset_silently(resting: Any) -> None:
     scene, _ = resting
     text = model.mjcf(structs.take(scene, 0), config=PhysicsConfig())
     spec = mujoco.MjModel.from_xml_string(text)
@@ -210,7 +210,7 @@ def test_two_objects_side_by_side_are_both_held(engine: Any) -> None:
     np.testing.assert_array_equal(outcome.held, [[True, True, False]])
 
 
-def test_a_gripper_that_is_stopped_says_so(engine: Any, resting: Any) -> None:
+def test_a_gripper_that_is_stopped_is_a_fault(engine: Any, resting: Any) -> None:
     scene, poses = resting
     heavy = scene.replace(mass=np.full_like(scene.mass, 60.0))
     stopped, free = (primitives.push(engine, each, poses, _pushes(5)) for each in (heavy, scene))
@@ -267,7 +267,9 @@ def test_unknown_engine_is_refused() -> None:
 @pytest.mark.parametrize(
     ("device", "cores", "engine"), [("cpu", 2, "native"), ("gpu", 2, "mjx"), ("gpu", 16, "native")]
 )
-def test_auto_is_what_is_faster_there(monkeypatch: pytest.MonkeyPatch, device: str, cores: int, engine: str) -> None:
+def test_auto_is_the_faster_engine_of_the_machine(
+    monkeypatch: pytest.MonkeyPatch, device: str, cores: int, engine: str
+) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: device)
     monkeypatch.setattr(physics, "cores", lambda: cores)
     assert physics.resolve("auto") == engine and physics.resolve("warp") == "warp"

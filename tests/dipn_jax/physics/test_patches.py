@@ -1,4 +1,4 @@
-"""MJX patched for the whole process: models that are not ours step as if it were not."""
+"""MJX with our patches: models that are not ours step as they do without them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ FOREIGN = """<mujoco model="dipn_jax">
  <body pos="0 0 .039"><freejoint/><geom type="mesh" mesh="wedge"/></body>
  <body pos=".012 .004 .078" euler="3 10 20"><freejoint/><geom type="mesh" mesh="wedge"/></body>
 </worldbody></mujoco>"""
-"""Two wedges of a mesh, one on the other, on a box: every collider that is patched, and an elliptic cone."""
+"""Two wedges of a mesh, one on the other, on a box: a model with every patched collider and an elliptic cone."""
 
 
 @pytest.fixture
 def unpatched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """MJX as it was imported, for one test; an engine of another test may have patched it."""
+    """Undo the patches of MJX for one test; an engine of another test may have made them."""
     monkeypatch.setattr(solver, "solve", getattr(solver.solve, "upstream", solver.solve))
     table = collision_driver._COLLISION_FUNC
     for types in patches._PATCHED_PAIRS:
@@ -41,7 +41,7 @@ def unpatched(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _stepped(steps: int) -> Any:
-    """Positions, velocities and contacts of the foreign model after some steps, in a program traced now."""
+    """Return positions, velocities and contacts of the foreign model after some steps, in a newly traced program."""
     m = mjx.put_model(mujoco.MjModel.from_xml_string(FOREIGN), impl="jax")
     step = jax.jit(lambda d: mjx.step(m, d))
     d = mjx.make_data(m).replace(qvel=jnp.full(12, 0.3))
@@ -65,7 +65,7 @@ def test_a_foreign_model_steps_as_if_there_were_no_engine() -> None:
 
 
 @pytest.mark.usefixtures("unpatched")
-def test_models_of_ours_are_solved_and_collided_by_us(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_our_models_use_our_solver_and_colliders(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
     def noting(module: Any, name: str) -> None:

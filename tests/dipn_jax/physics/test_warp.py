@@ -1,4 +1,4 @@
-"""MuJoCo Warp: refused in one line where it cannot run, and the native engine's equal where it can."""
+"""MuJoCo Warp: refused in one line where it cannot run, and equal to the native engine where it can."""
 
 import sys
 from typing import Any
@@ -36,7 +36,7 @@ def test_it_follows_the_native_engine(warp_engine: Any, engine: Any, settled: An
     np.testing.assert_array_equal(found.fault & ~Fault.UNSETTLED, wanted.fault & ~Fault.UNSETTLED)
 
 
-def test_what_is_not_finite_or_outside_is_a_fault_of_its_own_episode(warp_engine: Any, settled: Any) -> None:
+def test_a_position_that_is_not_finite_or_outside_is_a_fault_of_its_own_episode(warp_engine: Any, settled: Any) -> None:
     scene, poses = structs.take(settled.scene, np.array([0, 1, 1])), settled.poses[[0, 1, 1]].copy()
     poses[0, 0, 2] = np.nan
     poses[1, 1, 0] = WORKSPACE.half + 0.01

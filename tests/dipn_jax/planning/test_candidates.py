@@ -48,7 +48,7 @@ def test_feasible_pushes_start_free_inside_and_aim_at_an_object(settled: Any) ->
     assert all(near), "15 pixels ahead of the start is an object"
 
 
-def test_other_key_other_pushes_same_key_same_pushes(settled: Any) -> None:
+def test_the_key_decides_the_pushes(settled: Any) -> None:
     seen = _seen(settled)
     draw = [candidates.sample_pushes(jax.random.key(k), seen, count=16, distance=0.1)[0] for k in (0, 0, 1)]
     np.testing.assert_array_equal(draw[0].start, draw[1].start)
@@ -91,7 +91,7 @@ def test_best_grasp_is_the_highest() -> None:
     assert index.tolist() == [5, 17, 200] and np.isclose(score, 0.9)
 
 
-def test_a_grasp_is_where_its_index_says() -> None:
+def test_a_grasp_is_at_the_place_of_its_index() -> None:
     index = np.array([[3, 100, 20], [15, 0, 223]])
     taken = candidates.grasp_at(index, jnp.zeros((224, 224)))
     np.testing.assert_array_equal(candidates.grasp_index(taken), index)
@@ -117,7 +117,7 @@ def test_the_best_grasps_stand_apart() -> None:
     np.testing.assert_array_equal(candidates.best_grasps(scores, count=2), [[0, 10, 10], [2, 40, 40]])
 
 
-def test_grasps_like_one_that_missed_are_doubted() -> None:
+def test_grasps_like_one_that_missed_have_half_the_score() -> None:
     scores = jnp.full((16, 64, 64), 0.8)
     missed = np.array([[15, 30, 20], [15, 30, 24], [-1, -1, -1]])
     found = np.asarray(candidates.discount_missed(scores, missed))
@@ -164,7 +164,7 @@ def test_the_hand_stops_on_what_a_finger_meets() -> None:
     assert tip(0.09, 0.04) == pytest.approx(0.05)  # goes by far over it
 
 
-def test_what_reaches_the_border_goes_on_beyond_it() -> None:
+def test_an_object_at_the_border_is_assumed_to_extend_beyond_it() -> None:
     height = np.zeros((224, 224), np.float32)
     height[100:125, 180:] = 0.03
     across = np.array([[0, 112, 200], [4, 112, 200]])  # a finger outside the map; none
@@ -172,7 +172,7 @@ def test_what_reaches_the_border_goes_on_beyond_it() -> None:
     np.testing.assert_allclose(found, [0.024, 0.02], atol=1e-6)
 
 
-def test_what_fingers_come_down_on_is_where_the_simulated_fingers_are(settled: Any, rng: np.random.Generator) -> None:
+def test_under_fingers_agrees_with_the_simulated_fingers(settled: Any, rng: np.random.Generator) -> None:
 
     height = np.asarray(render.render(structs.take(settled.scene, 0), settled.poses[0]).height)
     center = rng.uniform(-0.1, 0.1, (30, 2)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Alg. 2 with a predictor and a scorer whose answers are known."""
+"""Alg. 2 with predictors and scorers whose results are known."""
 
 from typing import Any
 
@@ -12,28 +12,31 @@ from dipn_jax.planning import candidates, planner, predictors
 from dipn_jax.sight import fingers, masks, render
 from dipn_jax.structs import Observation, Push
 
-SLOTS, COUNT = 5, 8
+SLOTS = 5
+"""Object slots of a scene."""
+COUNT = 8
+"""Number of candidates."""
 
 
 def covered(images: jax.Array) -> jax.Array:
-    """Scores that grow with the height of what is seen; the best is that of the highest pixel."""
+    """Return scores that grow with the height of objects; the best is at the highest pixel."""
     return jnp.broadcast_to(jnp.clip(images[..., 3] * 5, 0, 1)[:, None], (images.shape[0], 16, 224, 224))
 
 
 def bare(images: jax.Array) -> jax.Array:
-    """Scores that grow with the table seen."""
+    """Return scores that grow with the visible area of the table."""
     return 1 - covered(images)
 
 
 def stack_for_the_third(observation: Observation, pushes: Push) -> jax.Array:
-    """With the third candidate every object ends in the middle, on top of one another: less is covered."""
+    """Predict that the third candidate moves every object to the middle, on top of one another."""
     centers, _ = masks.mask_centers(observation.label, SLOTS)
     still = jnp.zeros((COUNT, SLOTS, 3))
     return still.at[2, :, :2].set(-centers)
 
 
 def bare_squared(images: jax.Array) -> jax.Array:
-    """High where nothing is, only if nearly nothing is anywhere: one stack scores far more than a full table."""
+    """Return scores that are high on bare table, and far higher if nearly all of it is bare."""
     share = (images[..., 3] > 0).mean((1, 2))
     return jnp.broadcast_to(jnp.exp(-20 * share)[:, None, None, None], (images.shape[0], 16, 224, 224))
 
@@ -42,7 +45,7 @@ static = predictors.static_predictor
 
 
 def away(observation: Observation, pushes: Push) -> jax.Array:
-    """Everything slides off the table."""
+    """Predict that everything slides off the table."""
     return static(observation, pushes).at[..., 0].set(0.5)
 
 
@@ -55,7 +58,7 @@ def _decide(seen: Observation, predictor: Any, scorer: Any, **rule: Any) -> Any:
     return planner.decide(jax.random.key(0), seen, predictor, scorer, count=COUNT, rule=planner.Rule(**rule))
 
 
-def test_a_sure_grasp_is_taken_at_once(seen: Observation) -> None:
+def test_a_grasp_above_the_threshold_is_taken_at_once(seen: Observation) -> None:
     decision = _decide(seen, static, covered, grasp_above=0.01)
     assert not decision.is_push
     row, col = np.unravel_index(np.argmax(seen.height), (224, 224))
@@ -63,7 +66,7 @@ def test_a_sure_grasp_is_taken_at_once(seen: Observation) -> None:
     assert np.isneginf(decision.values).all(), "no push was considered"
 
 
-def test_a_push_that_changes_nothing_is_not_worth_it(seen: Observation) -> None:
+def test_a_push_that_changes_nothing_is_not_chosen(seen: Observation) -> None:
     decision = _decide(seen, static, covered, grasp_above=1.0)
     assert not decision.is_push
     feasible = np.asarray(decision.candidates.feasible)
@@ -71,7 +74,7 @@ def test_a_push_that_changes_nothing_is_not_worth_it(seen: Observation) -> None:
     assert np.isneginf(decision.values[~feasible]).all()
 
 
-def test_gamma_and_threshold_are_values(seen: Observation) -> None:
+def test_gamma_and_threshold_are_traced_values(seen: Observation) -> None:
     # with gamma above 1 even a push that changes nothing wins
     decision = _decide(seen, static, covered, grasp_above=1.0, gamma=1.1)
     assert decision.is_push and decision.value_push > decision.value_now
@@ -115,7 +118,7 @@ def test_clauses_of_the_released_code(seen: Observation) -> None:
     assert (released.edge_factor, released.grasp_lone, released.push_must_raise_best) == (2.0, True, True)
 
 
-def test_a_predicted_motion_counts_as_far_as_it_is_executed(seen: Observation) -> None:
+def test_a_predicted_motion_is_extended_by_the_edge_factor(seen: Observation) -> None:
     def some(observation: Observation, pushes: Push) -> jax.Array:
         return static(observation, pushes).at[..., 0].set(0.06)
 
@@ -124,7 +127,7 @@ def test_a_predicted_motion_counts_as_far_as_it_is_executed(seen: Observation) -
     assert near.any() and not far.any()
 
 
-def test_the_better_of_two_values_is_done(seen: Observation) -> None:
+def test_the_action_of_the_higher_value_is_chosen(seen: Observation) -> None:
     def valued(value: float) -> Any:
         return lambda images: jnp.full((images.shape[0], 16, 224, 224), value).at[:, 2, 112, 30].add(0.1)
 

@@ -18,7 +18,7 @@ def test_geometric_labels_of_a_bar() -> None:
     assert crowded[80, 80] == 0, "a finger would land on the neighbour"
 
 
-def test_a_finger_that_would_land_on_something_tall_makes_a_grasp_doubtful() -> None:
+def test_a_finger_that_would_land_on_something_tall_blocks_the_grasp() -> None:
     # a cube in the middle, and 38 to 56 mm to the right of its centre a wall: over a fingertip at 20 mm by 30, or by 15
     cube = jnp.zeros((224, 224)).at[100:125, 100:125].set(0.05)
     tall, low = (cube.at[60:164, 131:140].set(high) for high in (0.05, 0.035))

@@ -48,7 +48,7 @@ def test_distinct_colours_are_opencvs_components(seen: Observation) -> None:
 
 
 def _boxes(*boxes: tuple[int, int, int, int, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Height and colour of boxes (row, row, col, col, metres, red)."""
+    """Return height and colour of boxes (row, row, col, col, metres, red)."""
     height, color = np.zeros((224, 224), np.float32), np.full((224, 224, 3), 0.2, np.float32)
     for r0, r1, c0, c1, z, red in boxes:
         height[r0:r1, c0:c1] = z
@@ -64,14 +64,14 @@ def test_a_part_under_another_object_is_bridged_and_a_gap_is_not() -> None:
     assert apart[110, 70] != apart[110, 130] and apart[110, 100] == ABSENT
 
 
-def test_the_largest_come_first_and_the_rest_is_dropped() -> None:
+def test_the_largest_masks_come_first_and_the_rest_is_dropped() -> None:
     image = _boxes((10, 30, 10, 30, 0.05, 0.9), (50, 100, 50, 100, 0.05, 0.4), (150, 160, 150, 160, 0.05, 0.9))
     found = segment.segment(*image, slots=2)
     assert found[75, 75] == 0 and found[20, 20] == 1 and found[155, 155] == ABSENT
     assert (segment.segment(*_boxes(), slots=2) == ABSENT).all()
 
 
-def test_the_foot_of_a_slope_is_told_by_its_colour() -> None:
+def test_the_foot_of_a_slope_is_recognized_by_its_colour() -> None:
     height, color = _boxes((100, 120, 100, 140, 0.05, 0.9))
     height[100:120, 100:140] = np.linspace(0, 0.05, 40)
     assert (segment.segment(height, color, slots=1)[102:118, 102:138] == 0).all()
@@ -92,7 +92,7 @@ def test_found_masks_take_the_numbers_of_their_objects() -> None:
     assert (label[15, 15], label[75, 75], label[165, 165]) == (2, 0, 1)
 
 
-def test_what_is_no_image_is_refused() -> None:
+def test_an_array_that_is_not_an_image_is_refused() -> None:
     height, color = _boxes()
     with pytest.raises(UserError, match="crop it to the workspace"):
         segment.segment(height[1:], color, slots=2)

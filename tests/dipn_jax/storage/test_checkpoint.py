@@ -26,7 +26,7 @@ def _leaves(model: nnx.Module) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(nnx.state(model))]
 
 
-def test_what_is_loaded_is_what_was_saved(tmp_path: pathlib.Path) -> None:
+def test_saved_weights_are_loaded_unchanged(tmp_path: pathlib.Path) -> None:
     model = _save(tmp_path, 10, seed=3)
     loaded = checkpoint.load_network(tmp_path, network="grasp")
     assert loaded.config == CONFIG
@@ -92,7 +92,7 @@ def test_the_shipped_weights_load_where_no_device_has_the_name_of_the_one_that_s
 
 
 @pytest.mark.parametrize("damage", ["flip", "empty", "no meta"])
-def test_a_damaged_step_is_passed_over(tmp_path: pathlib.Path, damage: str) -> None:
+def test_a_damaged_step_is_skipped(tmp_path: pathlib.Path, damage: str) -> None:
     good = _save(tmp_path, 1, seed=1)
     _save(tmp_path, 2, seed=2)
     step = tmp_path / "checkpoints" / "00000002"
@@ -120,7 +120,7 @@ def test_only_the_newest_steps_are_kept(tmp_path: pathlib.Path) -> None:
     assert (tmp_path / "checkpoints" / "00000002").exists(), "the damaged step does not push out the good one"
 
 
-def test_what_cannot_be_used_is_named(tmp_path: pathlib.Path) -> None:
+def test_a_run_that_cannot_be_used_is_named(tmp_path: pathlib.Path) -> None:
     with pytest.raises(UserError, match="no such folder"):
         checkpoint.load_network(tmp_path / "nowhere", network="grasp")
     with pytest.raises(UserError, match="no whole step"):

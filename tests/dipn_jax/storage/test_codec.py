@@ -1,4 +1,4 @@
-"""Columns come back within half a quantum, whatever they are kept as."""
+"""Columns are read within half a quantum of what was written, whatever type they are stored as."""
 
 import jax
 import numpy as np
@@ -31,7 +31,7 @@ def test_a_round_trip_loses_half_a_quantum_at_most(rng: np.random.Generator, pus
     jax.tree.map(np.testing.assert_array_equal, twice, stored)
 
 
-def test_what_does_not_move_is_zero(rng: np.random.Generator) -> None:
+def test_objects_that_do_not_move_are_stored_as_zeros(rng: np.random.Generator) -> None:
     columns = _columns(rng, push=True)
     columns["poses"] = np.repeat(columns["poses"][:, :1], 11, 1)
     columns["after"] = columns["poses"][:, -1]
@@ -45,12 +45,12 @@ def test_a_palette_colour_is_exact() -> None:
     np.testing.assert_allclose(codec.decode(stored, specs)["scene.color"], color, atol=1e-7)
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_values_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="too large"):
         codec.encode({"scene.mass": np.full((1, 1), 3000.0, np.float32)})
 
 
-def test_what_is_not_finite_is_refused(rng: np.random.Generator) -> None:
+def test_values_that_are_not_finite_are_refused(rng: np.random.Generator) -> None:
     columns = _columns(rng, push=True)
     columns["poses"][0, 0, 0, 0] = np.nan
     with pytest.raises(ValueError, match="poses: not finite"):

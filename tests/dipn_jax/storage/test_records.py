@@ -15,7 +15,7 @@ def copy(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> pathlib.Path:
     return pathlib.Path(shutil.copytree(data["push"], tmp_path / "push"))
 
 
-def test_what_is_read_is_what_was_written(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
+def test_episodes_are_read_as_they_were_written(copy: pathlib.Path, tmp_path: pathlib.Path) -> None:
     episodes = shards.read_shard(shards.shard_path(copy, 0), kind="push")
     shards.write_shard(tmp_path, 3, episodes, kind="push", config={"seed": 0}, faults={})
     again = shards.read_shard(shards.shard_path(tmp_path, 3), kind="push")
@@ -25,7 +25,7 @@ def test_what_is_read_is_what_was_written(copy: pathlib.Path, tmp_path: pathlib.
     np.testing.assert_array_equal(again.push.start, episodes.push.start)
 
 
-def test_a_data_set_says_what_made_it(copy: pathlib.Path) -> None:
+def test_a_data_set_records_how_it_was_made(copy: pathlib.Path) -> None:
     summary = records.summary(copy)
     assert summary["episodes"] == 24 and summary["shards"] == 2 and summary["kind"] == "push"
     assert summary["config"]["seed"] == 0 and summary["config"]["engine"] == "native"
@@ -97,7 +97,9 @@ def test_the_fingerprint_follows_the_content(copy: pathlib.Path) -> None:
     assert records.load(copy, kind="push")[1] != before
 
 
-def test_a_write_that_dies_leaves_the_old_file(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_that_is_interrupted_leaves_the_old_file(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "manifest.json"
     files.write_json(path, {"a": 1})
 

@@ -12,7 +12,7 @@ from dipn_jax.world import cases, scenes, shapes
 CONFIG = scenes.fixed_count(5)
 
 
-def test_same_key_same_scene_other_key_other_scene() -> None:
+def test_the_key_decides_the_scene() -> None:
     a, b = (scenes.random_scene(jax.random.key(3), config=CONFIG) for _ in range(2))
     jax.tree.map(np.testing.assert_array_equal, a, b)
     c = scenes.random_scene(jax.random.key(4), config=CONFIG)

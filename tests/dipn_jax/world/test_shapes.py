@@ -9,7 +9,7 @@ SIZE = np.array([0.1, 0.05, 0.04])
 
 
 def _reference(index: int) -> mujoco.MjModel:
-    """The shape as MuJoCo computes it from meshes of density 1000."""
+    """Return the shape as MuJoCo computes it from meshes of density 1000."""
     meshes, geoms = "", ""
     for part in range(shapes.PARTS):
         n = shapes.CORNERS_USED[index, part]

@@ -1,4 +1,4 @@
-"""Methods that clear tables: who needs what, decisions in lockstep, sweeps."""
+"""Methods that clear tables: the networks they need, decisions in lockstep, sweeps."""
 
 import dataclasses
 import pathlib
@@ -34,7 +34,7 @@ CONFIGS: dict[str, tuple[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
-    """Networks that know nothing."""
+    """Return runs of networks with random weights."""
     folder = tmp_path_factory.mktemp("runs")
     for name, (network, config) in CONFIGS.items():
         model = checkpoint.build(network, config)
@@ -77,7 +77,7 @@ def test_every_method_decides_on_every_table_by_itself(
         assert np.abs(together.motion).max() > 0.01, "the engine was not asked, or moved nothing"
 
 
-def test_a_miss_is_kept_in_mind_until_something_near_it_moves(settled: Any) -> None:
+def test_a_miss_is_remembered_until_something_near_it_moves(settled: Any) -> None:
     poses = np.array(settled.poses[0], np.float32)
     poses[:, :2] = [[0, 0], [0.1, 0], [-0.1, 0], [0, 0.1], [0, -0.1]]
     made = Instance("one", structs.take(settled.scene, 0), poses, 5)
@@ -102,12 +102,12 @@ def test_a_miss_is_kept_in_mind_until_something_near_it_moves(settled: Any) -> N
 
 def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pathlib.Path]) -> None:
     for method, net in (("dipn+gn", "push"), ("vpg", "value"), ("physics+gn", "grasp")):
-        with pytest.raises(UserError, match=f"--method {method.replace('+', '.')}: wants --{net}-net"):
+        with pytest.raises(UserError, match=f"--method {method.replace('+', '.')}: needs --{net}-net"):
             _load(method, Networks(), engine)
     grasps_only = Networks(None, runs["grasp"], runs["only"])
-    with pytest.raises(UserError, match="has not learnt to push"):
+    with pytest.raises(UserError, match="was not trained to push"):
         _load("dqn+gn", grasps_only, engine)
-    with pytest.raises(UserError, match="has learnt values, not chances"):
+    with pytest.raises(UserError, match="predicts values, not chances"):
         _load("rea+dipn", _networks(runs), engine)
     with pytest.raises(UserError, match="holds a grasp network, want vpg"):
         _load("vpg", Networks(value=runs["grasp"]), engine)
@@ -115,7 +115,7 @@ def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pa
         _load("search", Networks(), engine)
 
 
-def test_of_several_distances_candidates_take_one_each() -> None:
+def test_each_candidate_takes_one_of_several_distances() -> None:
     config = PolicyConfig(candidates=5, distances=(0.03, 0.06))
     np.testing.assert_allclose(config.spread(), [0.03, 0.06, 0.03, 0.06, 0.03])
 
@@ -129,7 +129,7 @@ def test_tables_are_a_case_file_or_random() -> None:
         Tables("random", names=("a",))
 
 
-def test_a_repeat_of_a_case_is_the_same_however_many_others_there_are(engine: Any) -> None:
+def test_a_repeat_of_a_case_does_not_depend_on_the_number_of_repeats(engine: Any) -> None:
     path = cases.hard_cases_path()
     names, scene, poses = cases.load_cases(path, slots=6)
     few, more = (instances.hard_instances(engine, path, names[1:3], slots=6, repeats=count, seed=0) for count in (2, 3))
@@ -153,7 +153,7 @@ def test_a_sweep_has_a_candidate_for_every_distance(tmp_path: pathlib.Path) -> N
         command.sweep(tmp_path, builtin, builtin, "0.03:0.04:0.01", Tables("random"), candidates=1)
 
 
-def test_distances_are_parsed_and_nonsense_is_refused() -> None:
+def test_distances_are_parsed_and_invalid_ones_are_refused() -> None:
     assert sweeping.parse("0.03:0.12:0.01") == tuple(round(0.03 + 0.01 * i, 6) for i in range(10))
     assert sweeping.parse("0.05:0.05:0.01") == (0.05,)
     for wrong in ("0.03", "a:b:c", "0.1:0.03:0.01", "0.03:0.1:0", "0.03:0.1:0.02"):
@@ -161,7 +161,7 @@ def test_distances_are_parsed_and_nonsense_is_refused() -> None:
             sweeping.parse(wrong)
 
 
-def test_a_sweep_goes_on_at_the_distance_where_it_was_stopped(
+def test_a_sweep_continues_at_the_distance_where_it_was_stopped(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
@@ -184,7 +184,7 @@ def test_a_sweep_goes_on_at_the_distance_where_it_was_stopped(
     assert metrics.read(tmp_path)["sweep/0.03/pushes"] == 1 and metrics.read(tmp_path)["sweep/0.04/pushes"] == 3
 
 
-def test_a_longer_push_is_harder_to_foresee(engine: Any) -> None:
+def test_a_longer_push_is_harder_to_predict(engine: Any) -> None:
     config = scenes.fixed_count(3, spread=0.2)
     values = sweeping.prediction_errors(
         predictors.static_predictor, engine, config, (0.03, 0.12), scenes=6, seed=0, longest=0.12

@@ -1,4 +1,4 @@
-"""Tables are cleared together, and every step is kept."""
+"""Tables are cleared together, and every step is recorded."""
 
 import json
 import pathlib

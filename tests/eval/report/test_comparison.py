@@ -20,7 +20,7 @@ def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib
     )
 
 
-def test_the_course_of_clearing_is_what_was_left_after_each_action(cleared: Any) -> None:
+def test_the_course_of_clearing_is_the_share_left_after_each_action(cleared: Any) -> None:
     tables, out = cleared
     shares = comparison.course(comparison.Cleared(out), np.array([0.0, 3.0]))
     left = [(table.scene.shape >= 0).sum() / table.objects for table in tables]

@@ -14,7 +14,7 @@ from dipn_jax.world import scenes
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
 
-def test_learning_curves_show_whatever_lines_have(tmp_path: pathlib.Path) -> None:
+def test_learning_curves_show_the_measures_that_exist(tmp_path: pathlib.Path) -> None:
     lines = [{"step": 10, "reward/grasp": 0.5}, {"step": 20, "reward/push": 0.25}, {"step": 30, "reward/grasp": 0.75}]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     drawn = {line.get_label(): line.get_xydata().tolist() for line in page._curves([tmp_path]).axes[0].lines}
