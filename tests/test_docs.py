@@ -161,7 +161,6 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
 
 @pytest.mark.slow
 def test_the_tutorial_clears_its_table(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "tutorial").mkdir()
     with contextlib.chdir(tmp_path):
         names = tutorial_pictures.run(ROOT / "docs" / "tutorial.md")
     assert names["actions"][0] == "push" and names["actions"].count("grasp") == 4
