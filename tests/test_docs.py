@@ -95,6 +95,8 @@ def test_commands_are_ones_that_exist(page: pathlib.Path, capfd: pytest.CaptureF
                 assert all((ROOT / option).exists() for option in options if option.endswith(".py")), words
             case ["python", "-m", "experiments.moving_picture", *options]:
                 tyro.cli(functools.wraps(moving_picture.main)(lambda **_: None), args=options)
+            case ["python", "-m", module, *options] if module.startswith("experiments."):
+                assert importlib.import_module(module).main(["--dry-run", *options]) == 0, words
             case [program, *_]:
                 assert program in runs.PROGRAMS and parsed(words), words
     assert not capfd.readouterr().err

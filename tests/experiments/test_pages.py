@@ -9,10 +9,10 @@ import pytest
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
-from experiments import clearing, grasping, pages, push_prediction, runs
+from experiments import clearing, demo, grasping, pages, push_prediction, runs
 
 DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"
-PAGES = {"push-prediction": push_prediction, "grasping": grasping, "clearing": clearing}
+PAGES = {"push-prediction": push_prediction, "grasping": grasping, "clearing": clearing, "demo": demo}
 
 
 def _figures(name: str) -> dict[str, Any]:
@@ -170,3 +170,24 @@ def test_the_page_of_clearing_is_written(docs: pathlib.Path) -> None:
     clearing.write_page(root, docs=docs)
     _unchanged(docs, "clearing", values)
     assert files.read_json(docs / "sweep.json") == sweep
+
+
+def test_the_page_of_the_demo_is_written_only_on_request(
+    docs: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo.write_page, "__kwdefaults__", {"docs": docs})
+    root, before = docs.parent / "demo", (docs / "demo.md").read_text()
+    assert demo.main(["--page", "--out", str(root)]) == 2
+    assert "no such file" in capsys.readouterr().err and not (docs / "demo.json").exists()
+    values = _figures("demo")
+    _put(root, values)
+    for run in demo.list_runs(root):
+        runs.write_stamp(run, runs.keys(demo.list_runs(root))[run.name], complete=True)
+    assert demo.main(["--out", str(root)]) == 0
+    assert (docs / "demo.md").read_text() == before and not (docs / "demo.json").exists()
+    assert demo.main(["--page", "--out", str(root)]) == 0
+    written = files.read_json(docs / "demo.json")
+    made = written.pop("made")
+    assert written == values and set(made) == {run.name for run in demo.list_runs(root)}
+    expected = pages.with_box(before, pages.box({**values, "made": made}))
+    assert (docs / "demo.md").read_text() == expected
