@@ -1,4 +1,4 @@
-# make demo   set up, then generate, train, clear tables and write demo/report.html (10 minutes on 2 cores)
+# make demo   set up, then generate, train, clear tables and write demo/report.html
 # make test   lint, types, tests
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
 # make push-figures, make grasp-figures, make clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md

@@ -1,10 +1,11 @@
-"""`python -m benchmarks.page FILE.json ...` writes the figures of several runs as the tables of docs/benchmarks.md."""
+"""`python -m benchmarks.page FILE.json ...`: figures and their origins as the tables of docs/benchmarks.md."""
 
 from __future__ import annotations
 
 import pathlib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from benchmarks.__main__ import BENCHMARKS
 from benchmarks.harness import Figures
@@ -46,6 +47,30 @@ def tables(figures: Figures) -> str:
     return "\n\n".join("\n".join(table) for table in (ratios, speeds, others) if len(table) > 2) + "\n"
 
 
+OTHERS = ("torch", "pybullet")
+"""Packages that only some rows need, whose versions a machine has as keys of its own."""
+
+
+def origins(kept: dict[str, Any]) -> str:
+    """Machines, commits, versions and seeds behind the figures of a file, as a Markdown table with a row for each.
+
+    Args:
+      kept: what a file of `--out` holds, or several merged by hand, where `machine` is a list and says its `rows`.
+    """
+    machines = kept["machine"] if isinstance(kept["machine"], list) else [kept["machine"]]
+    titles = ["figures", "machine", "commit", "versions", "scale", "seed"]
+    lines = [_row(titles), _row(["---"] * len(titles))]
+    for facts in machines:
+        place = [facts["processor"], f"{facts['cores']} core{'s' * (facts['cores'] > 1)}"]
+        place += [device for device in facts["devices"] if device != "cpu"]
+        shown = {name: facts["versions"].get(name) for name in ("jax", "mujoco", "warp-lang")}
+        shown |= {name: facts.get(name) for name in OTHERS}
+        versions = [f"python {facts['python']}", *(f"{name} {found}" for name, found in shown.items() if found)]
+        cells = [facts.get("rows", "all"), ", ".join(place), facts["commit"], ", ".join(versions)]
+        lines.append(_row([*cells, facts["scale"], str(facts["seed"])]))
+    return "\n".join(lines) + "\n"
+
+
 def merged(paths: Sequence[pathlib.Path]) -> Figures:
     """Return the figures of several files of `--out`; of one measured twice, the later file's."""
     figures: Figures = {}
@@ -55,4 +80,5 @@ def merged(paths: Sequence[pathlib.Path]) -> Figures:
 
 
 if __name__ == "__main__":
-    console.say(tables(merged([pathlib.Path(name) for name in sys.argv[1:]])))
+    given = [pathlib.Path(name) for name in sys.argv[1:]]
+    console.say("\n".join([tables(merged(given)), *(origins(files.read_json(path)) for path in given)]))

@@ -24,6 +24,7 @@ def main(
     *,
     folder: str = "results",
     page: WritePage | None = None,
+    page_on_request: bool = False,
     arguments: Sequence[str] | None = None,
 ) -> int:
     """Run the command line of an experiment and return the exit code.
@@ -34,28 +35,32 @@ def main(
       list_runs: its runs.
       folder: where results go unless `--out` says otherwise.
       page: what to write when all runs are complete.
+      page_on_request: whether it is written only where `--page` asks for it, which carries out no run.
       arguments: of the command line; those of the process if not given.
     """
-    options = _parser(module, description, folder).parse_args(arguments)
+    options = _parser(module, description, folder, page_on_request).parse_args(arguments)
 
     def work() -> int:
         listed = list_runs(options.out)
         chosen = runs.select(listed, options.only)
         if options.list:
             return _show(chosen)
+        if page and page_on_request and options.page:
+            page(options.out)
+            return 0
         found = runs.keys(listed)
         if options.dry_run:
             return _rehearse(chosen, found)
         console.require_out(options.out)
         code = runs.carry_out(chosen, found)
-        if not code and page and len(chosen) == len(listed):
+        if not code and page and not page_on_request and len(chosen) == len(listed):
             page(options.out)
         return code
 
     return console.exit_code(work)
 
 
-def _parser(module: str, description: str, folder: str) -> argparse.ArgumentParser:
+def _parser(module: str, description: str, folder: str, page_on_request: bool) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"python -m experiments.{module}",
         description=description,
@@ -69,6 +74,10 @@ def _parser(module: str, description: str, folder: str) -> argparse.ArgumentPars
     parser.add_argument(
         "--out", type=pathlib.Path, default=pathlib.Path(folder), metavar="FOLDER", help=f"of results ({folder})"
     )
+    if page_on_request:
+        parser.add_argument(
+            "--page", action="store_true", help="write the page in docs from complete runs; run nothing"
+        )
     return parser
 
 

@@ -1,9 +1,10 @@
 """The demo: a small data set of each kind, both networks, their evaluations, and one report.
 
     python -m experiments.demo          # or make demo, which also sets up .venv
+    python -m experiments.demo --page   # afterwards: docs/demo.json and the tables of docs/demo.md
 
-About ten minutes on 2 cores; the report is demo/report.html, its numbers demo/metrics.json. It shows that every part
-works, not how good the system can be.
+The report is demo/report.html, its numbers demo/metrics.json. It shows that every part works, not how good the system
+can be.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ from __future__ import annotations
 import pathlib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
-from experiments import command
+from dipn_jax import files
+from dipn_jax.errors import UserError
+from experiments import command, pages
 from experiments.runs import Recipe, Run
 
 
@@ -46,9 +50,85 @@ def list_runs(root: pathlib.Path) -> list[Run]:
     return run.runs
 
 
+PREDICTORS = {
+    "dipn": "DIPN (`compact`, 1,500 pushes, a tenth of them held out)",
+    "trans": "`trans`: only the pushed object moves",
+    "static": "`static`: nothing moves",
+    "physics": "the engine itself, nominal mass and friction",
+}
+"""Rows of the table of prediction errors, and their titles."""
+
+TABLES = {"hard": "the ten hard instances, once each", "random-10": "random, 10 objects"}
+"""Rows of the table of cleared tables, and their titles."""
+
+
+def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [titles, ["---"] * len(titles), *rows]
+    return "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
+
+
+def _share(values: dict[str, Any], key: str) -> str:
+    """A share with its interval, in per cent."""
+    return f"{100 * values[key]:.1f} [{100 * values[f'{key}_low']:.0f}, {100 * values[f'{key}_high']:.0f}]"
+
+
+def tables(values: dict[str, Any]) -> list[str]:
+    """All tables of the page, from the numbers of the report."""
+    columns = ("5cm/all", "5cm/moved", "10cm/all", "10cm/moved")
+    errors = [
+        [title, *(f"{values[f'push_error/{name}/{column}']:.3f}" for column in columns)]
+        for name, title in PREDICTORS.items()
+    ]
+    gn = f"GN (`compact`, 1,500 grasps, a tenth of them held out): all {values['attempts']} until the tables were empty"
+    grasps = [
+        [title, _share(values, f"grasp_success/{name}")]
+        for name, title in (
+            ("gn", gn),
+            ("gn_first", "its first on each table"),
+            ("random_foreground", "random foreground pixel, random angle"),
+        )
+    ]
+    shares = ("completion", "grasp_success_all", "efficiency_all")
+    cleared = []
+    for name, title in TABLES.items():
+        at = f"clear/{name}/dipn+gn"
+        cells = [_share(values, f"{at}/{key}") for key in shares]
+        cleared.append([title, f"{values[f'{at}/instances']}", *cells, f"{values[f'{at}/pushes']}"])
+    errors_of = f"error of the predicted masks, true 1-IoU, {values['pushes']} held-out pushes"
+    grasps_on = f"grasps on {values['scenes']} unseen tables of 10 objects"
+    headings = ["tables", "completion", "grasp success, all", "efficiency, all", "pushes"]
+    return [
+        _table([errors_of, "5 cm, all objects", "5 cm, moved", "10 cm, all", "10 cm, moved"], errors),
+        _table([grasps_on, "success %"], grasps),
+        _table(["clearing with Alg. 2, %", *headings], cleared),
+    ]
+
+
+def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
+    """Write demo.json, and the tables and the box of demo.md, to `docs`.
+
+    Raises:
+      UserError: the demo in `root` is not complete.
+    """
+    metrics = root / "metrics.json"
+    if not metrics.exists():
+        raise UserError(f"{metrics}: no such file; it is written by python -m experiments.demo --out {root}")
+    values = files.read_json(metrics)
+    values[pages.MADE] = pages.made(list_runs(root))
+    pages.write("demo", values, tables(values), docs=docs)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
-    return command.main("demo", str(__doc__), list_runs, folder="demo", arguments=arguments)
+    return command.main(
+        "demo",
+        str(__doc__),
+        list_runs,
+        folder="demo",
+        page=write_page,
+        page_on_request=True,
+        arguments=arguments,
+    )
 
 
 if __name__ == "__main__":

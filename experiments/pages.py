@@ -25,6 +25,9 @@ BOX_WIDTH = 110
 MADE = "made"
 """Key of a page's JSON that holds what `made` returns; all other keys are numbers."""
 
+SHOWN = ("jax", "mujoco", "warp-lang")
+"""Packages whose versions stand in a box, where they are known."""
+
 
 def made(listed: Sequence[Run]) -> dict[str, Any]:
     """Return what the stamps of runs say about how they were made, by name of run, as JSON."""
@@ -37,7 +40,8 @@ def box(values: dict[str, Any]) -> str:
     """Return the box of a page as Markdown: number of figures, and machines, commits, versions and seeds of its runs.
 
     Args:
-      values: a page's JSON: numbers by name, and under `made`, if they are known, the facts about its runs.
+      values: a page's JSON: numbers by name, and under `made`, if they are known, the facts about its runs. Where they
+        were written by hand, after runs that kept no stamps, a name may stand for several runs, with a list of seeds.
     """
     found = values.get(MADE, {})
     lines = [f"figures: {sum(key != MADE for key in values):,}"]
@@ -49,7 +53,8 @@ def box(values: dict[str, Any]) -> str:
 
 def _machines(facts: dict[str, Any]) -> str:
     names = [
-        each["processor"] + (f", {each['cores']} cores" if each["cores"] else "") for each in facts.get("made_by", [])
+        each["processor"] + (f", {each['cores']} core{'s' * (each['cores'] > 1)}" if each["cores"] else "")
+        for each in facts.get("made_by", [])
     ]
     return " and ".join(dict.fromkeys(names)) or NOT_RECORDED
 
@@ -60,17 +65,18 @@ def _commits(facts: dict[str, Any]) -> str:
 
 def _versions(facts: dict[str, Any]) -> str:
     found = facts.get("versions", {})
-    return ", ".join(f"{name} {found[name]}" for name in ("jax", "mujoco") if name in found) or NOT_RECORDED
+    return ", ".join(f"{name} {found[name]}" for name in SHOWN if name in found) or NOT_RECORDED
 
 
 def _seeds(facts: dict[str, Any]) -> str:
     if "seed" not in facts:
         return NOT_RECORDED
-    return "none" if facts["seed"] is None else f"{facts['seed']:,}"
+    seeds = facts["seed"] if isinstance(facts["seed"], list) else [facts["seed"]]
+    return ", ".join("none" if seed is None else f"{seed:,}" for seed in seeds)
 
 
 def _grouped(by_run: dict[str, str]) -> str:
-    """Return each value once with the names of its runs; the most frequent value comes last, without names."""
+    """Each value once, with the runs that have it; the one that most have goes last, without their names if several."""
     if not by_run:
         return NOT_RECORDED
     groups: dict[str, list[str]] = {}
@@ -78,7 +84,8 @@ def _grouped(by_run: dict[str, str]) -> str:
         groups.setdefault(value, []).append(run)
     *few, most = sorted(groups, key=lambda value: len(groups[value]))
     named = [f"{value} ({', '.join(groups[value])})" for value in few]
-    return "; ".join([*named, f"{most} (all others)" if few else most])
+    others = ", ".join(groups[most]) if len(groups[most]) == 1 else "all others"
+    return "; ".join([*named, f"{most} ({others})" if few else most])
 
 
 def with_box(text: str, content: str) -> str:

@@ -25,7 +25,6 @@ def run(page: pathlib.Path) -> dict[str, Any]:
 def main() -> None:
     """Make the pictures where the page looks for them."""
     with contextlib.chdir(DOCS):
-        pathlib.Path("tutorial").mkdir(exist_ok=True)
         run(DOCS / "tutorial.md")
 
 

@@ -95,6 +95,8 @@ def test_commands_on_pages_exist(page: pathlib.Path, capfd: pytest.CaptureFixtur
                 assert all((ROOT / option).exists() for option in options if option.endswith(".py")), words
             case ["python", "-m", "experiments.moving_picture", *options]:
                 tyro.cli(functools.wraps(moving_picture.main)(lambda **_: None), args=options)
+            case ["python", "-m", module, *options] if module.startswith("experiments."):
+                assert importlib.import_module(module).main(["--dry-run", *options]) == 0, words
             case [program, *_]:
                 assert program in runs.PROGRAMS and parsed(words), words
     assert not capfd.readouterr().err
@@ -161,7 +163,6 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
 
 @pytest.mark.slow
 def test_the_tutorial_clears_its_table(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "tutorial").mkdir()
     with contextlib.chdir(tmp_path):
         names = tutorial_pictures.run(ROOT / "docs" / "tutorial.md")
     assert names["actions"][0] == "push" and names["actions"].count("grasp") == 4

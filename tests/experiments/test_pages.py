@@ -9,10 +9,26 @@ import pytest
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
-from experiments import clearing, grasping, pages, push_prediction, runs
+from experiments import clearing, demo, grasping, pages, push_prediction, runs
 
 DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"
-PAGES = {"push-prediction": push_prediction, "grasping": grasping, "clearing": clearing}
+PAGES = {"push-prediction": push_prediction, "grasping": grasping, "clearing": clearing, "demo": demo}
+
+
+def _figures(name: str) -> dict[str, Any]:
+    """The numbers of a page's JSON, without how they were made."""
+    return {key: value for key, value in files.read_json(DOCS / f"{name}.json").items() if key != pages.MADE}
+
+
+@pytest.mark.parametrize("name", [*PAGES, "world"])
+def test_the_boxes_in_docs_are_those_of_the_kept_facts(name: str) -> None:
+    text, values = (DOCS / f"{name}.md").read_text(), files.read_json(DOCS / f"{name}.json")
+    assert values[pages.MADE] and all(
+        each["processor"] for run in values[pages.MADE].values() for each in run["made_by"]
+    )
+    box = pages.box(values)
+    assert pages.with_box(text, box) == text
+    assert not any(line.endswith(f": {runs.NOT_RECORDED}") for line in box.splitlines())
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -24,7 +40,6 @@ def test_the_pages_in_docs_show_the_figures_in_docs(name: str) -> None:
         tables.append(page.swept(files.read_json(DOCS / "sweep.json")))
     for table in tables:
         assert table in text and pages.with_table(text, table) == text
-    assert pages.with_box(text, pages.box(values)) == text
 
 
 FACTS = {
@@ -51,6 +66,8 @@ def test_a_box_lists_machines_and_commits_and_what_is_not_recorded() -> None:
         "seed: 1 (runs/1); 1,000,000 (curve); none (report); not recorded (old); 0 (all others)\n"
         "```\n"
     )
+    several = {"networks": {**FACTS["data"], "seed": [0, 1, 2]}, "evaluations": {**FACTS["data"], "seed": 1_000_000}}
+    assert "seed: 0, 1, 2 (networks); 1,000,000 (evaluations)\n" in pages.box({"made": several})
     alike = pages.box({"made": {name: FACTS["data"] for name in ("data", "x")}})
     assert "machine: A, 2 cores\ncommit: abc\n" in alike
     unknown = pages.box({f"figure-{i}": 0.0 for i in range(1200)})
@@ -109,7 +126,7 @@ def _unchanged(docs: pathlib.Path, name: str, values: dict[str, Any]) -> None:
 
 
 def test_the_page_of_push_prediction_is_written(docs: pathlib.Path) -> None:
-    values = files.read_json(DOCS / "push-prediction.json")
+    values = _figures("push-prediction")
     root = docs.parent
     listed = push_prediction.list_runs(root)
     folders = {key.partition("/")[0] for key in values} & {run.name for run in listed}
@@ -125,7 +142,7 @@ def test_the_page_of_push_prediction_is_written(docs: pathlib.Path) -> None:
 
 
 def test_the_page_of_grasping_is_written(docs: pathlib.Path) -> None:
-    values = files.read_json(DOCS / "grasping.json")
+    values = _figures("grasping")
     own = {key: value for key, value in values.items() if key.startswith("online/")}
     results = docs.parent / "grasp"
     _put(results / "online", own, "curve.png")
@@ -137,7 +154,7 @@ def test_the_page_of_grasping_is_written(docs: pathlib.Path) -> None:
 
 
 def test_the_page_of_clearing_is_written(docs: pathlib.Path) -> None:
-    values, sweep = (files.read_json(DOCS / f"{name}.json") for name in ("clearing", "sweep"))
+    values, sweep = _figures("clearing"), files.read_json(DOCS / "sweep.json")
     root = docs.parent
     for run in clearing.list_runs(root):
         if run.name.startswith("table/"):
@@ -153,3 +170,24 @@ def test_the_page_of_clearing_is_written(docs: pathlib.Path) -> None:
     clearing.write_page(root, docs=docs)
     _unchanged(docs, "clearing", values)
     assert files.read_json(docs / "sweep.json") == sweep
+
+
+def test_the_page_of_the_demo_is_written_only_on_request(
+    docs: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo.write_page, "__kwdefaults__", {"docs": docs})
+    root, before = docs.parent / "demo", (docs / "demo.md").read_text()
+    assert demo.main(["--page", "--out", str(root)]) == 2
+    assert "no such file" in capsys.readouterr().err and not (docs / "demo.json").exists()
+    values = _figures("demo")
+    _put(root, values)
+    for run in demo.list_runs(root):
+        runs.write_stamp(run, runs.keys(demo.list_runs(root))[run.name], complete=True)
+    assert demo.main(["--out", str(root)]) == 0
+    assert (docs / "demo.md").read_text() == before and not (docs / "demo.json").exists()
+    assert demo.main(["--page", "--out", str(root)]) == 0
+    written = files.read_json(docs / "demo.json")
+    made = written.pop("made")
+    assert written == values and set(made) == {run.name for run in demo.list_runs(root)}
+    expected = pages.with_box(before, pages.box({**values, "made": made}))
+    assert (docs / "demo.md").read_text() == expected
