@@ -8,10 +8,12 @@ import pkgutil
 import shutil
 import subprocess
 import sys
+import tomllib
 import venv
 import zipfile
 
 import pytest
+from packaging.requirements import Requirement
 
 import dipn_jax
 
@@ -143,6 +145,28 @@ def test_the_makefile_is_short_and_its_modules_exist() -> None:
     modules = {word for line in lines for word in line.split() if word.startswith("experiments.")}
     for name in modules - {"experiments.NAME"}:
         assert (ROOT / name.replace(".", "/")).with_suffix(".py").is_file(), name
+
+
+def _pins() -> dict[str, str]:
+    """Versions of `constraints.txt`."""
+    return dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines())
+
+
+def test_the_versions_that_figures_were_made_with_are_allowed_and_faulty_ones_are_not() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    allowed = {one.name: one.specifier for one in map(Requirement, project["dependencies"])}
+    pins = _pins()
+    for name, versions in allowed.items():
+        assert versions.contains(pins[name]), name
+    for name in ("mujoco", "mujoco-mjx"):
+        assert not allowed[name].contains("4.0.0") and allowed[name].contains("4.0.1")
+
+
+def test_pins_leave_room_for_viser_and_botocore() -> None:
+    pins = _pins()
+    for room in ("rich<15", "websockets<17", "python-dateutil<3"):
+        one = Requirement(room)
+        assert one.specifier.contains(pins[one.name]), room
 
 
 def test_no_file_is_longer_than_300_lines() -> None:
