@@ -5,6 +5,8 @@ The only module of the library that prints. Importing it imports no JAX, so that
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import inspect
 import itertools
 import math
@@ -20,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
+from dipn_jax import files
 from dipn_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,7 +40,9 @@ def enable_compilation_cache() -> None:
     # on some processors XLA logs an error for every program that it finds in the cache, though it runs them (openxla
     # issue 44565); it reads this variable when JAX is first imported
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    home = os.environ.get("XDG_CACHE_HOME") or str(pathlib.Path.home() / ".cache")
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if home.startswith("~"):  # a user without a home folder, as in some containers: nothing is kept
+        return
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(pathlib.Path(home) / "dipn-jax" / "xla")
     settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.5}
     for name, value in settings.items():
@@ -170,6 +175,28 @@ class Interruption:
         self.__exit__()
 
 
+def with_absolute_paths(value: Any) -> Any:
+    """Return a parsed option with every path in it expanded and absolute; the name `builtin` is no path."""
+    if isinstance(value, pathlib.Path):
+        return value if str(value) == "builtin" else files.absolute(value)
+    if isinstance(value, tuple):
+        return tuple(map(with_absolute_paths, value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
+        return dataclasses.replace(value, **{name: with_absolute_paths(each) for name, each in fields.items()})
+    return value
+
+
+def _with_paths(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `command` with the paths among its arguments made absolute before it begins."""
+
+    @functools.wraps(command)
+    def called(*positional: Any, **named: Any) -> Any:
+        return command(*with_absolute_paths(positional), **{k: with_absolute_paths(v) for k, v in named.items()})
+
+    return called
+
+
 def _described(command: Callable[..., Any], *, whole: bool) -> str:
     """The text of a command's help: the first sentence of its docstring, or everything before `Args:`.
 
@@ -237,7 +264,7 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
         Annotated[
             Any,
             tyro.conf.subcommand(
-                name, constructor=command, description=_described(command, whole=name in arguments[:1])
+                name, constructor=_with_paths(command), description=_described(command, whole=name in arguments[:1])
             ),
         ]
         for name, command in commands.items()

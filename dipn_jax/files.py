@@ -40,6 +40,18 @@ def code_digest(*folders: pathlib.Path) -> str:
     return digest.hexdigest()
 
 
+def absolute(path: pathlib.Path | str) -> pathlib.Path:
+    """Return a path that a user gave with `~` expanded, and absolute; links in it stay.
+
+    Raises:
+      UserError: there is no such home folder.
+    """
+    try:
+        return pathlib.Path(path).expanduser().absolute()
+    except RuntimeError:
+        raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
+
+
 def file_sha256(path: pathlib.Path) -> str:
     """SHA-256 of a file's bytes, in hex."""
     digest = hashlib.sha256()

@@ -193,7 +193,7 @@ def config_from_json(name: str, values: dict[str, Any]) -> Any:
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
     """Return the folder of a run; `builtin` stands for the network that comes with the package, if one does."""
     if str(run) != "builtin":
-        return run
+        return files.absolute(run)
     folder = pathlib.Path(__file__).parents[1] / "data" / network
     if not folder.is_dir():
         raise UserError(f"builtin: no {network} network comes with this package; give the --out of a dipn-train run")

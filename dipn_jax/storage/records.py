@@ -149,7 +149,7 @@ def read_episodes(folder: pathlib.Path | str) -> Any:
     Raises:
       UserError: there is no data set, or a shard of it is damaged.
     """
-    folder = pathlib.Path(folder)
+    folder = files.absolute(folder)
     episodes, _ = load(folder, kind=str(summary(folder)["kind"]))
     return episodes
 

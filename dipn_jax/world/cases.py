@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dipn_jax import geometry
+from dipn_jax import files, geometry
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Scene
 from dipn_jax.workspace import WORKSPACE
@@ -42,7 +42,7 @@ def load_cases(
     Raises:
       UserError: the file is missing, is not JSON, or an object in it has an unknown shape or a wrong size.
     """
-    path = hard_cases_path() if path is None else pathlib.Path(path)
+    path = hard_cases_path() if path is None else files.absolute(path)
     try:
         cases = json.loads(path.read_text())["cases"]
     except OSError as error:

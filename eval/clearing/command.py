@@ -99,7 +99,8 @@ def _settings(given: dict[str, Any]) -> dict[str, Any]:
     """The options of a command by name, those of its tables as `tables.NAME`."""
     tables: Tables = given["tables"]
     others = {key: value for key, value in given.items() if key != "tables"}
-    return others | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+    chosen = {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+    return others | chosen | ({} if tables.cases in ("hard", "random") else {"tables.cases": tables.path()})
 
 
 def _check(out: pathlib.Path, seed: int, config: PolicyConfig, tables: Tables) -> None:
