@@ -70,7 +70,7 @@ def run(out: pathlib.Path, plan: Plan) -> None:
         metrics.update(files.read_json(path))
     files.write_json(out / "settings.json", settings)
     files.write_json(out / "metrics.json", metrics)
-    files.write_atomically(out / "world.md", page(metrics).encode())
+    files.write_text(out / "world.md", page(metrics))
     console.say(page(metrics))
 
 

@@ -5,9 +5,11 @@ The only module of the library that prints. Importing it imports no JAX, so that
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
 import functools
 import inspect
+import io
 import itertools
 import math
 import os
@@ -114,6 +116,13 @@ class Progress:
             file=sys.stderr,
             flush=True,
         )
+
+
+def _use_utf8() -> None:
+    """Let output be UTF-8 where the locale knows ASCII only; names of files keep the bytes that they have."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and codecs.lookup(stream.encoding).name == "ascii":
+            stream.reconfigure(encoding="utf-8", errors="surrogateescape")
 
 
 def say(text: str) -> None:
@@ -224,6 +233,7 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
     Returns:
       The exit code, as `exit_code`.
     """
+    _use_utf8()
     enable_compilation_cache()
     return exit_code(lambda: _parse_and_call(description, commands, sys.argv[1:] if arguments is None else arguments))
 

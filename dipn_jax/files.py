@@ -76,9 +76,22 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def read_text(path: pathlib.Path) -> str:
+    """Return a text file's content: UTF-8, with or without a byte-order mark, whatever the locale says."""
+    return path.read_text(encoding="utf-8-sig")
+
+
+def write_text(path: pathlib.Path, text: str) -> None:
+    """Write a text file atomically, as UTF-8 whatever the locale says.
+
+    Where the locale knows no UTF-8, Python has the bytes of a path's name as surrogates: they become those bytes again.
+    """
+    write_atomically(path, text.encode("utf-8", "surrogateescape"))
+
+
 def write_json(path: pathlib.Path, value: Any) -> None:
     """Write JSON atomically, keys in the given order."""
-    write_atomically(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
@@ -88,7 +101,7 @@ def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
       UserError: it is missing, is not JSON, or is not a `wanted` at its top.
     """
     try:
-        value = json.loads(path.read_text())
+        value = json.loads(read_text(path))
     except FileNotFoundError:
         raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
     except (OSError, ValueError):

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import pathlib
 import pkgutil
+import re
 import shutil
 import subprocess
 import sys
@@ -145,6 +146,17 @@ def test_the_makefile_is_short_and_its_modules_exist() -> None:
     modules = {word for line in lines for word in line.split() if word.startswith("experiments.")}
     for name in modules - {"experiments.NAME"}:
         assert (ROOT / name.replace(".", "/")).with_suffix(".py").is_file(), name
+
+
+def test_text_files_are_read_and_written_as_utf8() -> None:
+    """A call that opens a text file names its encoding, or the locale chooses one; `files` has functions for both."""
+    for package in (*PACKAGES, "experiments"):
+        for path in (ROOT / package).rglob("*.py"):
+            for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+                if re.search(r"(?<!files)(?<!os)\.(read_text|write_text|open)$", ast.unparse(call.func)):
+                    modes = [str(arg.value) for arg in call.args if isinstance(arg, ast.Constant)]
+                    named = any(keyword.arg == "encoding" for keyword in call.keywords)
+                    assert named or any("b" in mode for mode in modes), f"{path}: {ast.unparse(call)}"
 
 
 def _pins() -> dict[str, str]:

@@ -25,7 +25,7 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
     Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
     folder take turns.
     """
-    with (folder / ".lock").open("w") as lock:
+    with (folder / ".lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         return _rebuild_manifest(folder)
 
@@ -60,7 +60,7 @@ def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """Return the manifest of a data set; raise UserError if it is missing or damaged."""
     path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text())
+        manifest = json.loads(files.read_text(path))
         for entry in manifest["shards"].values():
             if not {"bytes", "sha256", "episodes", "faults"} <= set(entry):
                 raise KeyError

@@ -44,7 +44,7 @@ def load_cases(
     """
     path = hard_cases_path() if path is None else files.absolute(path)
     try:
-        cases = json.loads(path.read_text())["cases"]
+        cases = json.loads(files.read_text(path))["cases"]
     except OSError as error:
         raise UserError(
             f"case file {path}: {error.strerror}; give a JSON file in the format of {hard_cases_path().name}"

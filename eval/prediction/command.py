@@ -95,4 +95,4 @@ def _save_pictures(out: pathlib.Path, films: dict[str, np.ndarray], values: dict
     np.savez_compressed(out / "films.npz", **films)  # type: ignore[arg-type]
     for which in ("all", "moved") if curve else ():
         curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
-        files.write_atomically(out / f"curve-{which}.md", curves.push_table(values, which=which).encode())
+        files.write_text(out / f"curve-{which}.md", curves.push_table(values, which=which))
