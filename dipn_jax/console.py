@@ -6,7 +6,6 @@ The only module of the library that prints. Importing it imports no JAX, so that
 from __future__ import annotations
 
 import codecs
-import dataclasses
 import functools
 import inspect
 import io
@@ -184,24 +183,13 @@ class Interruption:
         self.__exit__()
 
 
-def with_absolute_paths(value: Any) -> Any:
-    """Return a parsed option with every path in it expanded and absolute; the name `builtin` is no path."""
-    if isinstance(value, pathlib.Path):
-        return value if str(value) == "builtin" else files.absolute(value)
-    if isinstance(value, tuple):
-        return tuple(map(with_absolute_paths, value))
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
-        return dataclasses.replace(value, **{name: with_absolute_paths(each) for name, each in fields.items()})
-    return value
-
-
 def _with_paths(command: Callable[..., Any]) -> Callable[..., Any]:
     """Return `command` with the paths among its arguments made absolute before it begins."""
 
     @functools.wraps(command)
     def called(*positional: Any, **named: Any) -> Any:
-        return command(*with_absolute_paths(positional), **{k: with_absolute_paths(v) for k, v in named.items()})
+        options = {name: files.with_absolute_paths(value) for name, value in named.items()}
+        return command(*files.with_absolute_paths(positional), **options)
 
     return called
 
@@ -266,6 +254,26 @@ def exit_code(work: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         print("interrupted: the same command goes on from here", file=sys.stderr)
         return 130
+    except Exception:
+        missing = _missing_device()
+        if missing is None:
+            raise
+        print(f"error: {missing}", file=sys.stderr)
+        return 2
+
+
+def _missing_device() -> str | None:
+    """Return what is wrong where JAX has been imported and finds no device to compute on; else None."""
+    jax = sys.modules.get("jax")
+    try:
+        if jax is not None:
+            jax.devices()
+    except Exception as error:  # an AssertionError without a word, where no plug-in knows the platform
+        asked = os.environ.get("JAX_PLATFORMS")
+        given = f"JAX_PLATFORMS={asked}" if asked else "JAX"
+        why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0]
+        return f"{given}: no such device here{f' ({why})' if why else ''}; unset JAX_PLATFORMS, or set it to cpu"
+    return None
 
 
 def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> None:

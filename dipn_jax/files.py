@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
@@ -50,6 +51,18 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
         return pathlib.Path(path).expanduser().absolute()
     except RuntimeError:
         raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
+
+
+def with_absolute_paths(value: Any) -> Any:
+    """Return a parsed option with every path in it expanded and absolute; the name `builtin` is no path."""
+    if isinstance(value, pathlib.Path):
+        return value if str(value) == "builtin" else absolute(value)
+    if isinstance(value, tuple):
+        return tuple(map(with_absolute_paths, value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
+        return dataclasses.replace(value, **{name: with_absolute_paths(each) for name, each in fields.items()})
+    return value
 
 
 def file_sha256(path: pathlib.Path) -> str:

@@ -169,6 +169,29 @@ def test_help_imports_nothing_that_is_slow(stage: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("platform", ["cuda", "bananas"])
+def test_a_device_that_is_not_there_is_one_line(platform: str, tmp_path: pathlib.Path) -> None:
+    """Each command comes to JAX in its own way: its default device, a seed, a network."""
+    scripts = [["datagen", "images"], ["train", "grasp-online"], ["eval", "grasp", "--grasp-net", "builtin"]]
+    environment = os.environ | {"JAX_PLATFORMS": platform}
+    commands = [
+        [sys.executable, "-m", f"dipn_jax.{stage}.cli", *words, "--out", str(tmp_path / "o")]
+        for stage, *words in scripts
+    ]
+    started = [subprocess.Popen(each, stderr=subprocess.PIPE, env=environment, text=True) for each in commands]
+    for process in started:
+        error = process.communicate()[1]
+        _one_line((process.returncode, error), f"JAX_PLATFORMS={platform}: no such device here")
+
+
+def test_another_error_is_none_of_the_users() -> None:
+    def broken() -> None:
+        raise AssertionError("ours")
+
+    with pytest.raises(AssertionError, match="ours"):
+        console.exit_code(broken)
+
+
 def test_a_reader_that_has_seen_enough_is_no_mistake() -> None:
     ours, theirs = os.pipe()
     os.close(ours)

@@ -62,8 +62,8 @@ def test_every_path_of_every_command_is_absolute_when_it_begins(
 
 
 def test_builtin_is_a_name_and_stays_one(home: pathlib.Path) -> None:
-    assert console.with_absolute_paths(pathlib.Path("builtin")) == pathlib.Path("builtin")
-    assert console.with_absolute_paths(Tables("random")) == Tables("random")
+    assert files.with_absolute_paths(pathlib.Path("builtin")) == pathlib.Path("builtin")
+    assert files.with_absolute_paths(Tables("random")) == Tables("random")
 
 
 def test_a_home_that_is_not_there_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
