@@ -10,6 +10,7 @@ import sys
 import pytest
 from dipn_jax.datagen import cli as datagen_cli
 from dipn_jax.eval import cli as eval_cli
+from dipn_jax.eval import options
 from dipn_jax.train import cli as train_cli
 from flax import nnx
 
@@ -167,6 +168,23 @@ def test_help_imports_nothing_that_is_slow(stage: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_every_command_that_simulates_takes_threads(call, tmp_path: pathlib.Path) -> None:
+    """And refuses none: none of them has begun, and none of them takes it for something that the result depends on."""
+    net = ("--grasp-net", "builtin")
+    simulating = {
+        "datagen": (("push",), ("grasp",), ("images",), ("check-world",)),
+        "train": (("grasp-online",), ("baseline",)),
+        "eval": (("prediction", "--push-net", "builtin"), ("grasp", *net), ("clear", *net, "--method", "gn")),
+    }
+    for stage, commands in simulating.items():
+        for words in commands:
+            _one_line(call(stage, *words, "--out", tmp_path / "o", "--threads", "0"), "--threads 0: want at least 1")
+    sweep = ("sweep", *net, "--push-net", "builtin", "--out", tmp_path / "o", "--threads", "0")
+    _one_line(call("eval", *sweep), "--threads 0: want at least 1")
+    assert not (tmp_path / "o").exists()
+    assert options.settings({"seed": 1, "threads": 3}) == {"seed": 1}
 
 
 @pytest.mark.parametrize("platform", ["cuda", "bananas"])

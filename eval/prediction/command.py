@@ -25,6 +25,7 @@ def predict(
     objects: options.Objects = "1:7",
     seed: int = 1_000_000,
     engine: EngineName = "auto",
+    threads: int | None = None,
     physics: bool = True,
     segmented: bool = True,
     ranges: Ranges = DEFAULT_RANGES,
@@ -46,11 +47,12 @@ def predict(
       objects: number of objects in a scene.
       seed: of scenes and pushes; keep it away from the training data's.
       engine: the engine whose result counts as the truth.
+      threads: that native simulates on; one a core if not given.
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
       segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
       ranges: what random objects are drawn from.
     """
-    settings = dict(locals())
+    settings = options.settings(locals())
     options.check(out, seed, scenes=scenes_)
     if not push_net and not curve:
         raise UserError("prediction: nothing to measure; give --push-net or --curve")
@@ -69,7 +71,7 @@ def predict(
     partial = resume.Partial(out, settings, inputs=[*([run] if run else []), *runs])
     values, films = push_errors.evaluate(
         networks | compared,
-        make_engine(engine),
+        make_engine(engine, threads=threads),
         config,
         partial,
         scenes=scenes_,
