@@ -151,8 +151,10 @@ def _curves(runs: Sequence[pathlib.Path]) -> Any:
             raise UserError(f"{run}: no readable metrics.jsonl; give the --out of a dipn-train command") from None
         for key in dict.fromkeys(k for line in lines for k in line if k != "step"):
             some = [line for line in lines if key in line]
-            axis.plot([line["step"] for line in some], [line[key] for line in some], marker=".", label=key)
-        axis.set(title=run.name, xlabel="steps", yscale="log")
+            axis.plot(
+                [line["step"] for line in some], [line[key] for line in some], marker=".", label=drawing.label(key)
+            )
+        axis.set(title=drawing.label(run.name), xlabel="steps", yscale="log")
         axis.legend(fontsize=7)
         axis.grid(alpha=0.3)
     return figure
