@@ -65,6 +65,8 @@ ROTATIONS = 16
 """Grasp and push directions, evenly in [0, 2 pi)."""
 PUSH_STEPS = 10
 """Centimetres of a recorded push."""
+LOWEST_TIP = 0.02
+"""Metres above the table, the lowest that tips of fingers close at: what is not higher is beyond their reach."""
 
 
 def grasp_angles() -> np.ndarray:
