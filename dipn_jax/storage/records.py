@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import pathlib
@@ -15,6 +14,11 @@ from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import shards
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 MANIFEST = "manifest.json"
 """Name of the file that lists the shards of a data set."""
 
@@ -23,10 +27,11 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """List every readable shard of the folder in `manifest.json`, and return the manifest.
 
     Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
-    folder take turns.
+    folder take turns, where the system can lock files (Windows cannot by `fcntl`: there, one worker to a folder).
     """
     with (folder / ".lock").open("wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        if fcntl is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
         return _rebuild_manifest(folder)
 
 
