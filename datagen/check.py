@@ -44,7 +44,7 @@ class Plan:
         console.require_seed(self.seed)
 
 
-def run(out: pathlib.Path, plan: Plan) -> None:
+def run(out: pathlib.Path, plan: Plan, *, threads: int | None = None) -> None:
     """Measure, and write `metrics.json` and `world.md`; sections already measured with this plan are not repeated.
 
     Raises:
@@ -54,11 +54,11 @@ def run(out: pathlib.Path, plan: Plan) -> None:
     engines = {}
     for name in plan.engines:
         variant = world.ENGINES[name]
-        engines[name] = make_engine(variant.engine, timestep=variant.timestep, sleep=variant.sleep)
+        engines[name] = make_engine(variant.engine, timestep=variant.timestep, sleep=variant.sleep, threads=threads)
     code = {"versions": files.package_versions(), "code": files.code_digest(pathlib.Path(__file__).parent)}
     settings = json.loads(json.dumps(dataclasses.asdict(plan))) | code
     files.claim(out, settings, free=("engines",))
-    sections = _sections(plan, engines)
+    sections = _sections(plan, engines, threads)
     metrics: dict[str, float | None] = {}
     with console.Progress("check-world", len(sections), unit="sections") as progress:
         for name, measure in sections.items():
@@ -70,13 +70,13 @@ def run(out: pathlib.Path, plan: Plan) -> None:
         metrics.update(files.read_json(path))
     files.write_json(out / "settings.json", settings)
     files.write_json(out / "metrics.json", metrics)
-    files.write_atomically(out / "world.md", page(metrics).encode())
+    files.write_text(out / "world.md", page(metrics))
     console.say(page(metrics))
 
 
-def _sections(plan: Plan, engines: dict[str, Engine]) -> dict[str, Callable[[], dict[str, float]]]:
+def _sections(plan: Plan, engines: dict[str, Engine], threads: int | None) -> dict[str, Callable[[], dict[str, float]]]:
     """Return the functions that measure each section, by name."""
-    native = make_engine("native")
+    native = make_engine("native", threads=threads)
     keys = jax.random.split(jax.random.key(plan.seed), 3)
 
     @functools.cache

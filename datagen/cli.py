@@ -36,6 +36,8 @@ class Work:
     """This worker's number."""
     of: int = 1
     """Number of workers; each makes every of-th shard of the same data set."""
+    threads: int | None = None
+    """Threads that native simulates on, one a core if not given; shards are then made one at a time."""
 
 
 DEFAULT_WORK = Work()
@@ -45,7 +47,7 @@ DEFAULT_WORK = Work()
 def _generate(job: Job, out: pathlib.Path, work: Work, *, scorer: Scorer | None = None) -> None:
     from .generate import generate
 
-    generate(job, out, part=work.shard, of=work.of, scorer=scorer)
+    generate(job, out, part=work.shard, of=work.of, threads=work.threads, scorer=scorer)
 
 
 def push(
@@ -213,6 +215,7 @@ def check_world(
     few: int = 8,
     tries: int = 100,
     seed: int = 0,
+    threads: int | None = None,
 ) -> None:
     """Measure whether the simulated world is right: drops, grasps, pushes, the camera, and how far the engines agree.
 
@@ -226,10 +229,11 @@ def check_world(
       few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
       tries: grasps of every catalogue item.
       seed: random seed of everything.
+      threads: that native simulates on; one a core if not given.
     """
     from . import check
 
-    check.run(out, check.Plan(engines, scenes=scenes_, few=few, tries=tries, seed=seed))
+    check.run(out, check.Plan(engines, scenes=scenes_, few=few, tries=tries, seed=seed), threads=threads)
 
 
 def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:

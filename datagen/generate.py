@@ -136,7 +136,15 @@ def shard(
     return structs.concatenate(done), dict(counts)
 
 
-def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1, scorer: Scorer | None = None) -> None:
+def generate(
+    job: Job,
+    out: pathlib.Path,
+    *,
+    part: int = 0,
+    of: int = 1,
+    threads: int | None = None,
+    scorer: Scorer | None = None,
+) -> None:
     """Write the shards of `job` that are missing; worker `part` of `of` workers takes every `of`-th.
 
     Two shards are made at a time: while one is simulated, the other is simulated, too, or drawn, rendered or written.
@@ -146,6 +154,7 @@ def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1, scorer:
       out: its folder.
       part: number of this worker.
       of: number of workers.
+      threads: that `native` simulates on; shards are then made one at a time, so that no more are used.
       scorer: the network of `job.weights`, for guided and hard grasps.
 
     Raises:
@@ -156,21 +165,21 @@ def generate(job: Job, out: pathlib.Path, *, part: int = 0, of: int = 1, scorer:
     if not 0 <= part < of:
         raise UserError(f"--shard {part} --of {of}: want 0 <= shard < of")
     job = dataclasses.replace(job, engine=resolve(job.engine))
-    engine = make_engine(job.engine, timestep=job.timestep)
+    engine = make_engine(job.engine, timestep=job.timestep, threads=threads)
     _claim(job, out)
     mine = range(part, job.shards(), of)
     todo = [index for index in mine if not _written(out, index, job)]
     total = sum(map(job.size, mine))
     with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
-        _write_all(job, todo, out, engine, _Tally(progress), scorer)
+        _write_all(job, todo, out, engine, _Tally(progress), scorer, at_once=1 if threads else SHARDS_AT_ONCE)
     manifest = records.update_manifest(out)
     console.say(f"{out}: {manifest['episodes']} {job.kind} episodes in {len(manifest['shards'])} shards")
 
 
 def _write_all(
-    job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tally: _Tally, scorer: Scorer | None
+    job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tally: _Tally, scorer: Scorer | None, *, at_once: int
 ) -> None:
-    """Make and write the shards `todo`, SHARDS_AT_ONCE at a time; the first error stops all."""
+    """Make and write the shards `todo`, `at_once` at a time; the first error stops all."""
     # the content of a shard does not depend on how many others there are
     config = {key: value for key, value in job.describe().items() if key != "episodes"}
 
@@ -179,7 +188,7 @@ def _write_all(
         shards.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
         records.update_manifest(out)
 
-    with concurrent.futures.ThreadPoolExecutor(SHARDS_AT_ONCE) as pool:
+    with concurrent.futures.ThreadPoolExecutor(at_once) as pool:
         futures: list[concurrent.futures.Future[None]] = []
         try:
             futures += [pool.submit(one, index) for index in todo]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dipn_jax.planning.methods import load_policy
     from dipn_jax.planning.planner import Rule, decide
     from dipn_jax.sight.imagine import imagine
+    from dipn_jax.sight.observed import check_observation
     from dipn_jax.sight.render import render
     from dipn_jax.storage.checkpoint import load_network
     from dipn_jax.storage.records import read_episodes
@@ -41,6 +42,7 @@ __all__ = [
     "Scene",
     "SceneConfig",
     "UserError",
+    "check_observation",
     "decide",
     "imagine",
     "load_cases",
@@ -59,6 +61,7 @@ _MODULES = {
     "planning.methods": ("load_policy",),
     "planning.planner": ("Rule", "decide"),
     "sight.imagine": ("imagine",),
+    "sight.observed": ("check_observation",),
     "sight.render": ("render",),
     "storage.checkpoint": ("load_network",),
     "storage.records": ("read_episodes",),

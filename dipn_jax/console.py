@@ -5,7 +5,10 @@ The only module of the library that prints. Importing it imports no JAX, so that
 
 from __future__ import annotations
 
+import codecs
+import functools
 import inspect
+import io
 import itertools
 import math
 import os
@@ -20,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
+from dipn_jax import files
 from dipn_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,7 +41,9 @@ def enable_compilation_cache() -> None:
     # on some processors XLA logs an error for every program that it finds in the cache, though it runs them (openxla
     # issue 44565); it reads this variable when JAX is first imported
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    home = os.environ.get("XDG_CACHE_HOME") or str(pathlib.Path.home() / ".cache")
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if home.startswith("~"):  # a user without a home folder, as in some containers: nothing is kept
+        return
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(pathlib.Path(home) / "dipn-jax" / "xla")
     settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.5}
     for name, value in settings.items():
@@ -111,6 +117,13 @@ class Progress:
         )
 
 
+def _use_utf8() -> None:
+    """Let output be UTF-8 where the locale knows ASCII only; names of files keep the bytes that they have."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and codecs.lookup(stream.encoding).name == "ascii":
+            stream.reconfigure(encoding="utf-8", errors="surrogateescape")
+
+
 def say(text: str) -> None:
     """Print one line for the user on standard output."""
     print(text, flush=True)
@@ -170,6 +183,17 @@ class Interruption:
         self.__exit__()
 
 
+def _with_paths(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `command` with the paths among its arguments made absolute before it begins."""
+
+    @functools.wraps(command)
+    def called(*positional: Any, **named: Any) -> Any:
+        options = {name: files.with_absolute_paths(value) for name, value in named.items()}
+        return command(*files.with_absolute_paths(positional), **options)
+
+    return called
+
+
 def _described(command: Callable[..., Any], *, whole: bool) -> str:
     """Return the text of a command's help: the first sentence of its docstring, or everything before `Args:`.
 
@@ -197,6 +221,7 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
     Returns:
       The exit code, as `exit_code`.
     """
+    _use_utf8()
     enable_compilation_cache()
     return exit_code(lambda: _parse_and_call(description, commands, sys.argv[1:] if arguments is None else arguments))
 
@@ -229,6 +254,26 @@ def exit_code(work: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         print("interrupted: run the same command again to continue from here", file=sys.stderr)
         return 130
+    except Exception:
+        missing = _missing_device()
+        if missing is None:
+            raise
+        print(f"error: {missing}", file=sys.stderr)
+        return 2
+
+
+def _missing_device() -> str | None:
+    """Return what is wrong where JAX has been imported and finds no device to compute on; else None."""
+    jax = sys.modules.get("jax")
+    try:
+        if jax is not None:
+            jax.devices()
+    except Exception as error:  # an AssertionError without a word, where no plug-in knows the platform
+        asked = os.environ.get("JAX_PLATFORMS")
+        given = f"JAX_PLATFORMS={asked}" if asked else "JAX"
+        why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0]
+        return f"{given}: no such device here{f' ({why})' if why else ''}; unset JAX_PLATFORMS, or set it to cpu"
+    return None
 
 
 def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> None:
@@ -237,7 +282,7 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
         Annotated[
             Any,
             tyro.conf.subcommand(
-                name, constructor=command, description=_described(command, whole=name in arguments[:1])
+                name, constructor=_with_paths(command), description=_described(command, whole=name in arguments[:1])
             ),
         ]
         for name, command in commands.items()

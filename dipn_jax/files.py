@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
@@ -40,6 +41,30 @@ def code_digest(*folders: pathlib.Path) -> str:
     return digest.hexdigest()
 
 
+def absolute(path: pathlib.Path | str) -> pathlib.Path:
+    """Return a path that a user gave with `~` expanded, and absolute; links in it stay.
+
+    Raises:
+      UserError: there is no such home folder.
+    """
+    try:
+        return pathlib.Path(path).expanduser().absolute()
+    except RuntimeError:
+        raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
+
+
+def with_absolute_paths(value: Any) -> Any:
+    """Return a parsed option with every path in it expanded and absolute; the name `builtin` is no path."""
+    if isinstance(value, pathlib.Path):
+        return value if str(value) == "builtin" else absolute(value)
+    if isinstance(value, tuple):
+        return tuple(map(with_absolute_paths, value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
+        return dataclasses.replace(value, **{name: with_absolute_paths(each) for name, each in fields.items()})
+    return value
+
+
 def file_sha256(path: pathlib.Path) -> str:
     """Return the SHA-256 of a file's bytes, in hex."""
     digest = hashlib.sha256()
@@ -64,9 +89,22 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def read_text(path: pathlib.Path) -> str:
+    """Return a text file's content: UTF-8, with or without a byte-order mark, whatever the locale says."""
+    return path.read_text(encoding="utf-8-sig")
+
+
+def write_text(path: pathlib.Path, text: str) -> None:
+    """Write a text file atomically, as UTF-8 whatever the locale says.
+
+    Where the locale knows no UTF-8, Python has the bytes of a path's name as surrogates: they become those bytes again.
+    """
+    write_atomically(path, text.encode("utf-8", "surrogateescape"))
+
+
 def write_json(path: pathlib.Path, value: Any) -> None:
     """Write a JSON file atomically, keys in the given order."""
-    write_atomically(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
 def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
@@ -76,7 +114,7 @@ def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
       UserError: it is missing, is not JSON, or is not a `wanted` at its top.
     """
     try:
-        value = json.loads(path.read_text())
+        value = json.loads(read_text(path))
     except FileNotFoundError:
         raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
     except (OSError, ValueError):

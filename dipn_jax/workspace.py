@@ -67,6 +67,8 @@ ROTATIONS = 16
 """Number of directions of grasps and pushes, evenly in [0, 2 pi)."""
 PUSH_STEPS = 10
 """Length of a recorded push in centimetres."""
+LOWEST_TIP = 0.02
+"""Lowest height in metres at which the fingertips close: what is not higher is beyond their reach."""
 
 
 def grasp_angles() -> np.ndarray:

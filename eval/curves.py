@@ -79,8 +79,8 @@ def load_grasp_runs(runs: Sequence[pathlib.Path]) -> dict[str, dict[int, list[fl
         if "pretrained" not in config:
             raise UserError(f"--curve {run}: no run of dipn-train grasp-online")
         try:
-            lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-        except (OSError, json.JSONDecodeError):
+            lines = [json.loads(line) for line in files.read_text(run / "metrics.jsonl").splitlines()]
+        except (OSError, ValueError):
             raise UserError(f"--curve {run}: no readable metrics.jsonl; train again") from None
         group = found.setdefault("with" if config["pretrained"] else "without", {})
         for line in lines:

@@ -19,11 +19,22 @@ from dipn_jax import files
 from dipn_jax.workspace import WORKSPACE
 
 
+def escaped(text: str) -> str:
+    """What a user named, for a page: neither markup nor the place of a figure (`{NAME}`)."""
+    return html.escape(text).replace("{", "&#123;")
+
+
+def label(text: str) -> str:
+    """What a user named, for a figure: `$` is no formula, bytes of a name that are no text are replaced."""
+    readable = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return readable.replace("$", r"\$")
+
+
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Return an HTML table of plain text."""
 
     def line(cells: list[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+        return "<tr>" + "".join(f"<{tag}>{escaped(cell)}</{tag}>" for cell in cells) + "</tr>"
 
     return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"
 
@@ -44,7 +55,9 @@ def image(figure: Any, path: pathlib.Path) -> str:
     figure.savefig(stream, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)
     files.write_atomically(path, stream.getvalue())
-    return f'<img alt="{path.stem}" src="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}">'
+    return (
+        f'<img alt="{escaped(path.stem)}" src="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}">'
+    )
 
 
 def show(axis: Any, picture: np.ndarray, title: str = "") -> None:
@@ -52,7 +65,7 @@ def show(axis: Any, picture: np.ndarray, title: str = "") -> None:
     half = WORKSPACE.half
     axis.imshow(picture, origin="lower", extent=(-half, half, -half, half), interpolation="nearest")
     axis.set(xticks=[], yticks=[], xlim=(-half, half), ylim=(-half, half))
-    axis.set_title(title, fontsize=9)
+    axis.set_title(label(title), fontsize=9)
 
 
 def arrow(axis: Any, push: np.ndarray) -> None:

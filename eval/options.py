@@ -24,6 +24,11 @@ def check(out: pathlib.Path, seed: int, **counts: int) -> None:
     console.require_out(out)
 
 
+def settings(given: dict[str, Any]) -> dict[str, Any]:
+    """The options of a command by name, without those on which no result depends."""
+    return {key: value for key, value in given.items() if key != "threads"}
+
+
 def plain(value: Any) -> Any:
     """Return an option as JSON can hold it."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -127,9 +127,9 @@ def write(name: str, values: dict[str, Any], tables: Sequence[str], *, docs: pat
       docs: folder of the page.
     """
     page = docs / f"{name}.md"
-    text = with_box(page.read_text(), box(values))
+    text = with_box(files.read_text(page), box(values))
     for table in tables:
         text = with_table(text, table)
     files.write_json(docs / f"{name}.json", values)
-    files.write_atomically(page, text.encode())
+    files.write_text(page, text)
     console.say(f"{page}: {len(tables)} tables")

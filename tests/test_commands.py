@@ -10,6 +10,7 @@ import sys
 import pytest
 from dipn_jax.datagen import cli as datagen_cli
 from dipn_jax.eval import cli as eval_cli
+from dipn_jax.eval import options
 from dipn_jax.train import cli as train_cli
 from flax import nnx
 
@@ -167,6 +168,46 @@ def test_help_imports_nothing_that_is_slow(stage: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_every_command_that_simulates_takes_threads(call, tmp_path: pathlib.Path) -> None:
+    """And refuses none: none of them has begun, and none of them takes it for something that the result depends on."""
+    net = ("--grasp-net", "builtin")
+    simulating = {
+        "datagen": (("push",), ("grasp",), ("images",), ("check-world",)),
+        "train": (("grasp-online",), ("baseline",)),
+        "eval": (("prediction", "--push-net", "builtin"), ("grasp", *net), ("clear", *net, "--method", "gn")),
+    }
+    for stage, commands in simulating.items():
+        for words in commands:
+            _one_line(call(stage, *words, "--out", tmp_path / "o", "--threads", "0"), "--threads 0: want at least 1")
+    sweep = ("sweep", *net, "--push-net", "builtin", "--out", tmp_path / "o", "--threads", "0")
+    _one_line(call("eval", *sweep), "--threads 0: want at least 1")
+    assert not (tmp_path / "o").exists()
+    assert options.settings({"seed": 1, "threads": 3}) == {"seed": 1}
+
+
+@pytest.mark.parametrize("platform", ["cuda", "bananas"])
+def test_a_device_that_is_not_there_is_one_line(platform: str, tmp_path: pathlib.Path) -> None:
+    """Each command comes to JAX in its own way: its default device, a seed, a network."""
+    scripts = [["datagen", "images"], ["train", "grasp-online"], ["eval", "grasp", "--grasp-net", "builtin"]]
+    environment = os.environ | {"JAX_PLATFORMS": platform}
+    commands = [
+        [sys.executable, "-m", f"dipn_jax.{stage}.cli", *words, "--out", str(tmp_path / "o")]
+        for stage, *words in scripts
+    ]
+    started = [subprocess.Popen(each, stderr=subprocess.PIPE, env=environment, text=True) for each in commands]
+    for process in started:
+        error = process.communicate()[1]
+        _one_line((process.returncode, error), f"JAX_PLATFORMS={platform}: no such device here")
+
+
+def test_another_error_is_none_of_the_users() -> None:
+    def broken() -> None:
+        raise AssertionError("ours")
+
+    with pytest.raises(AssertionError, match="ours"):
+        console.exit_code(broken)
 
 
 def test_a_closed_pipe_is_not_an_error() -> None:

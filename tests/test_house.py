@@ -5,13 +5,16 @@ import importlib
 import inspect
 import pathlib
 import pkgutil
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import venv
 import zipfile
 
 import pytest
+from packaging.requirements import Requirement
 
 import dipn_jax
 
@@ -143,6 +146,39 @@ def test_the_makefile_is_short_and_its_modules_exist() -> None:
     modules = {word for line in lines for word in line.split() if word.startswith("experiments.")}
     for name in modules - {"experiments.NAME"}:
         assert (ROOT / name.replace(".", "/")).with_suffix(".py").is_file(), name
+
+
+def test_text_files_are_read_and_written_as_utf8() -> None:
+    """A call that opens a text file names its encoding, or the locale chooses one; `files` has functions for both."""
+    for package in (*PACKAGES, "experiments"):
+        for path in (ROOT / package).rglob("*.py"):
+            for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+                if re.search(r"(?<!files)(?<!os)\.(read_text|write_text|open)$", ast.unparse(call.func)):
+                    modes = [str(arg.value) for arg in call.args if isinstance(arg, ast.Constant)]
+                    named = any(keyword.arg == "encoding" for keyword in call.keywords)
+                    assert named or any("b" in mode for mode in modes), f"{path}: {ast.unparse(call)}"
+
+
+def _pins() -> dict[str, str]:
+    """Versions of `constraints.txt`."""
+    return dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines())
+
+
+def test_the_versions_that_figures_were_made_with_are_allowed_and_faulty_ones_are_not() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    allowed = {one.name: one.specifier for one in map(Requirement, project["dependencies"])}
+    pins = _pins()
+    for name, versions in allowed.items():
+        assert versions.contains(pins[name]), name
+    for name in ("mujoco", "mujoco-mjx"):
+        assert not allowed[name].contains("4.0.0") and allowed[name].contains("4.0.1")
+
+
+def test_pins_leave_room_for_viser_and_botocore() -> None:
+    pins = _pins()
+    for room in ("rich<15", "websockets<17", "python-dateutil<3"):
+        one = Requirement(room)
+        assert one.specifier.contains(pins[one.name]), room
 
 
 def test_no_file_is_longer_than_300_lines() -> None:

@@ -225,4 +225,4 @@ def _log(out: pathlib.Path, config: BaselineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of actions after each round, and mean rewards of the last of them."""
     counts = range(config.tables, len(state.did) + 1, config.tables)
     rows = [{"step": n, **_rewards(state.did[:n], RECENT_ACTIONS)} for n in counts]
-    files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
+    files.write_text(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))

@@ -132,6 +132,7 @@ def grasp_online(
     init: pathlib.Path | None = None,
     objects: str = "10",
     engine: EngineName = "auto",
+    threads: int | None = None,
     config: OnlineConfig = GRASP_ONLINE,
 ) -> None:
     """Train GN while it grasps: the best grasp on each of several tables, then some steps on all outcomes so far.
@@ -144,6 +145,7 @@ def grasp_online(
       init: run to start from (grasp-pretrain's); without it the compact network begins with random weights.
       objects: number of objects on a fresh table: 10, or 1:7.
       engine: physics engine.
+      threads: that native simulates on; one a core if not given.
       config: amount and schedule of learning.
     """
     console.require_positive(grasps=config.grasps)
@@ -161,7 +163,7 @@ def grasp_online(
     else:
         model = checkpoint.build("grasp", GraspConfig(), seed=config.seed)
     config = dataclasses.replace(config, pretrained=init is not None)
-    result = online.learn(model, make_engine(engine), scenes.parse_objects(objects), config, out)
+    result = online.learn(model, make_engine(engine, threads=threads), scenes.parse_objects(objects), config, out)
     _say(out, result, digits=".3f")
 
 
@@ -170,6 +172,7 @@ def baseline(
     grasp_net: pathlib.Path | None = None,
     objects: str = "10",
     engine: EngineName = "auto",
+    threads: int | None = None,
     config: BaselineConfig = BASELINE,
 ) -> None:
     """Train a compared method while it acts: VPG, the grasps of its reactive form (REA), or DQN's pushes beside GN.
@@ -184,6 +187,7 @@ def baseline(
       grasp_net: run of dipn-train grasp or grasp-online, or builtin, whose grasps dqn takes.
       objects: number of objects on a fresh table: 10, or 1:7.
       engine: physics engine.
+      threads: that native simulates on; one a core if not given.
       config: method, and amount and schedule of learning.
     """
     console.require_positive(actions=config.actions)
@@ -197,7 +201,7 @@ def baseline(
 
     gn: Any = checkpoint.load_network(grasp_net, network="grasp") if grasp_net else None
     result = baselines.learn(
-        make_engine(engine),
+        make_engine(engine, threads=threads),
         scenes.parse_objects(objects),
         config,
         out,

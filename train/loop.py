@@ -203,19 +203,19 @@ class _Log:
 
     def __init__(self, out: pathlib.Path, begin: int) -> None:
         self.path = out / "metrics.jsonl"
-        old = self.path.read_text().splitlines() if self.path.exists() else []
+        old = files.read_text(self.path).splitlines() if self.path.exists() else []
         kept = [line for line in old if _step_of(line) <= begin]
-        files.write_atomically(self.path, "".join(line + "\n" for line in kept).encode())
+        files.write_text(self.path, "".join(line + "\n" for line in kept))
         self.events = tensorboardX.SummaryWriter(str(out / "events"), purge_step=begin)
 
     def write(self, step: int, values: dict[str, float]) -> None:
-        with self.path.open("a") as stream:
+        with self.path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps({"step": step, **values}) + "\n")
         for name, value in values.items():
             self.events.add_scalar(name, value, step)
 
     def last(self) -> dict[str, float]:
-        lines = self.path.read_text().splitlines()
+        lines = files.read_text(self.path).splitlines()
         return json.loads(lines[-1]) if lines else {}
 
     def close(self) -> None:

@@ -164,4 +164,4 @@ def _log(out: pathlib.Path, config: OnlineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of grasps after each round, and success over the last of them."""
     counts = range(config.tables, len(state.success) + 1, config.tables)
     rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT_GRASPS) : n]))} for n in counts]
-    files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
+    files.write_text(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))

@@ -79,7 +79,9 @@ def resolve(name: EngineName) -> EngineName:
     return name
 
 
-def make_engine(name: EngineName, *, timestep: float | None = None, sleep: float | None = None) -> Engine:
+def make_engine(
+    name: EngineName, *, timestep: float | None = None, sleep: float | None = None, threads: int | None = None
+) -> Engine:
     """Make the engine called `name`, with its own solver settings unless others are given.
 
     Example:
@@ -93,15 +95,19 @@ def make_engine(name: EngineName, *, timestep: float | None = None, sleep: float
       name: engine, or `auto`.
       timestep: seconds of a physics step, instead of the engine's own.
       sleep: `PhysicsConfig.sleep`, instead of the engine's own; only `native` can.
+      threads: on which `native` simulates, one a core if not given; no result depends on it.
 
     Raises:
-      UserError: no such engine, it cannot run here, or a time step that does not divide the control period.
+      UserError: no such engine, it cannot run here, fewer threads than one, or a time step that does not divide the
+        control period.
     """
     name = resolve(name)
+    if threads is not None and threads < 1:
+        raise UserError(f"--threads {threads}: want at least 1, or none given for one a core")
     if name == "native":
         from dipn_jax.physics import native
 
-        return native.NativeEngine(_configured(native.DEFAULTS, timestep, sleep))
+        return native.NativeEngine(_configured(native.DEFAULTS, timestep, sleep), threads=threads)
     if name == "mjx":
         from dipn_jax.physics import mjx
 

@@ -19,6 +19,7 @@ from dipn_jax.names import MethodName
 from dipn_jax.networks import vpg
 from dipn_jax.planning import planner, predictors, scorers
 from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
+from dipn_jax.sight import observed
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Decision, Observation
 
@@ -56,7 +57,12 @@ class Policy:
           key: random key, for the candidates.
           observation: what the camera sees.
           missed: grasps (rotation, row, col) that missed on this table as it is.
+
+        Raises:
+          UserError: the observation is none of those that `dipn_jax.check_observation` lets through.
         """
+        if not observed.is_traced(observation):
+            observed.check_observation(observation)
         return self.act(key, observation, missed, self.rule, self.distances)
 
     def with_config(self, config: PolicyConfig) -> Policy:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from dipn_jax import geometry
 from dipn_jax.structs import Array
-from dipn_jax.workspace import GRIPPER, ROTATIONS, TURNED_PIXELS, WORKSPACE, grasp_angles
+from dipn_jax.workspace import GRIPPER, LOWEST_TIP, ROTATIONS, TURNED_PIXELS, WORKSPACE, grasp_angles
 
 EMPTY_HEIGHT = 0.005
 """Height in metres up to which a pixel counts as empty table: no grasp is centred there, and none is learnt."""
@@ -37,7 +37,7 @@ HIDDEN_HEIGHT = 1.0
 
 def grasp_height(local_height: Float[Array, "*b"] | float) -> Float[jax.Array, "*b"]:
     """Return the fingertips' height for a surface `local_height` metres high. Source: DIPN's released code."""
-    return jnp.maximum(jnp.asarray(local_height) - 0.04, 0.02)
+    return jnp.maximum(jnp.asarray(local_height) - 0.04, LOWEST_TIP)
 
 
 def under_fingers(

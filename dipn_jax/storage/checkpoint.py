@@ -75,7 +75,7 @@ def save(
         checkpointer.save(temporary / name, _flat(tree))
     checkpointer.wait_until_finished()
     for marker in temporary.rglob("commit_success.txt"):  # Orbax writes the present folder into it
-        marker.write_text("Checkpoint commit was successful\n")
+        marker.write_bytes(b"Checkpoint commit was successful\n")
     stored = sorted(p for p in temporary.rglob("*") if p.is_file())
     meta = {
         "format_version": FORMAT_VERSION,
@@ -111,7 +111,7 @@ def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
 def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
     """Return the metadata of a step folder, or None if anything in it is missing or changed."""
     try:
-        meta = json.loads((folder / "meta.json").read_text())
+        meta = json.loads(files.read_text(folder / "meta.json"))
         good = all(files.file_sha256(folder / name) == digest for name, digest in meta["sha256"].items())
         good = good and meta["format_version"] == FORMAT_VERSION and meta["network"] in NETWORKS
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -193,7 +193,7 @@ def config_from_json(name: str, values: dict[str, Any]) -> Any:
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
     """Return the folder of a run; `builtin` stands for the network that comes with the package, if one does."""
     if str(run) != "builtin":
-        return run
+        return files.absolute(run)
     folder = pathlib.Path(__file__).parents[1] / "data" / network
     if not folder.is_dir():
         raise UserError(f"builtin: no {network} network comes with this package; give the --out of a dipn-train run")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import pathlib
@@ -16,6 +15,11 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import shards
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 MANIFEST = "manifest.json"
 """Name of the file that lists the shards of a data set."""
 
@@ -24,10 +28,11 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """List every readable shard of the folder in `manifest.json`, and return the manifest.
 
     Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
-    folder take turns.
+    folder take turns, where the system can lock files (Windows cannot by `fcntl`: there, one worker to a folder).
     """
-    with (folder / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with (folder / ".lock").open("wb") as lock:
+        if fcntl is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
         return _rebuild_manifest(folder)
 
 
@@ -61,7 +66,7 @@ def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """Return the manifest of a data set; raise UserError if it is missing or damaged."""
     path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text())
+        manifest = json.loads(files.read_text(path))
         for entry in manifest["shards"].values():
             if not {"bytes", "sha256", "episodes", "faults"} <= set(entry):
                 raise KeyError
@@ -151,7 +156,7 @@ def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | Se
     Raises:
       UserError: there is no data set, or a shard of it is damaged.
     """
-    folder = pathlib.Path(folder)
+    folder = files.absolute(folder)
     episodes: PushEpisode | GraspEpisode | SettledScene
     episodes, _ = load(folder, kind=str(summary(folder)["kind"]))
     return episodes

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dipn_jax import geometry
+from dipn_jax import files, geometry
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Scene
-from dipn_jax.workspace import WORKSPACE
+from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 from dipn_jax.world import scenes, shapes
 
 
@@ -41,11 +41,12 @@ def load_cases(
       Names, scenes and poses of C cases as placed: not settled. Density 500 kg/m^3, friction 0.35.
 
     Raises:
-      UserError: the file is missing, is not JSON, or an object in it has an unknown shape or a wrong size.
+      UserError: the file is missing, is not JSON, an object in it has an unknown shape or a wrong size, or
+        lies so low that the gripper cannot reach it.
     """
-    path = hard_cases_path() if path is None else pathlib.Path(path)
+    path = hard_cases_path() if path is None else files.absolute(path)
     try:
-        cases = json.loads(path.read_text())["cases"]
+        cases = json.loads(files.read_text(path))["cases"]
     except OSError as error:
         raise UserError(
             f"case file {path}: {error.strerror}; give a JSON file in the format of {hard_cases_path().name}"
@@ -110,6 +111,12 @@ def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, Floa
         center = rotation @ (shapes.UNIT_CENTER_OF_MASS[shape[i]] * size[i])  # from the middle of the box
         resting = 0.0005 - float((corners @ rotation[2]).min())
         z = resting if height is None else height + center[2]
+        top = z + float((corners @ rotation[2]).max())
+        if top <= LOWEST_TIP:
+            raise UserError(
+                f"{where}, object {i}: is {1000 * top:.0f} mm high as it lies, below the gripper's reach: its fingers "
+                f"close {1000 * LOWEST_TIP:.0f} mm above the table; turn it up, or leave it out"
+            )
         poses[i] = np.concatenate([position + center[:2], [z], quat])
     return scenes.nominal(Scene(shape, size, color, np.zeros(n), np.zeros(n))), poses
 

@@ -45,6 +45,7 @@ def clear(
     label: str = "",
     seed: int = 1_000_000,
     engine: EngineName = "auto",
+    threads: int | None = None,
 ) -> None:
     """Clear tables: push or grasp, until nothing is left.
 
@@ -74,6 +75,7 @@ def clear(
       label: for the report, what distinguishes this evaluation from others of its method, such as the data learnt from.
       seed: random seed of scenes, perturbations and candidates.
       engine: physics engine.
+      threads: that native simulates on; one a core if not given.
     """
     settings = _settings(locals())
     from dipn_jax.physics import make_engine
@@ -90,7 +92,7 @@ def clear(
         cautious=cautious,
     )
     _check(out, seed, config, tables)
-    networks, physics = Networks(push_net, grasp_net, value_net), make_engine(engine)
+    networks, physics = Networks(push_net, grasp_net, value_net), make_engine(engine, threads=threads)
     (decide,) = on_tables.load(method, networks, physics, [config])
     longest, runs = max(distance, SIMULATED_PUSH), networks.runs(method)
     _clear(out, decide, physics, tables, settings=settings, runs=runs, longest=longest, remember=remember)
@@ -99,8 +101,9 @@ def clear(
 def _settings(given: dict[str, Any]) -> dict[str, Any]:
     """Return the options of a command by name, those of its tables as `tables.NAME`."""
     tables: Tables = given["tables"]
-    others = {key: value for key, value in given.items() if key != "tables"}
-    return others | {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+    others = {key: value for key, value in options.settings(given).items() if key != "tables"}
+    chosen = {f"tables.{key}": value for key, value in dataclasses.asdict(tables).items()}
+    return others | chosen | ({} if tables.cases in ("hard", "random") else {"tables.cases": tables.path()})
 
 
 def _check(out: pathlib.Path, seed: int, config: PolicyConfig, tables: Tables) -> None:
@@ -127,6 +130,7 @@ def sweep(
     threshold: float = 0.7,
     seed: int = 1_000_000,
     engine: EngineName = "auto",
+    threads: int | None = None,
 ) -> None:
     """Clear the same tables at one push distance after another, and with the policy that chooses the distance itself.
 
@@ -145,6 +149,7 @@ def sweep(
       threshold: grasp at once above this score.
       seed: random seed of scenes, perturbations and candidates.
       engine: physics engine.
+      threads: that native simulates on; one a core if not given.
     """
     settings = _settings(locals()) | {"method": "dipn+gn", "label": ""}
     from dipn_jax.physics import make_engine
@@ -162,7 +167,7 @@ def sweep(
     _check(out, seed, chosen, tables)
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
     configs[sweeping.CHOSEN] = chosen
-    networks, physics = Networks(push_net, grasp_net), make_engine(engine)
+    networks, physics = Networks(push_net, grasp_net), make_engine(engine, threads=threads)
     kept = resume.Partial(out, settings, inputs=_inputs(networks.runs("dipn+gn"), tables))
     values = _clear_with_each(out, configs, networks, physics, tables, settings=settings, kept=kept)
     if pushes:

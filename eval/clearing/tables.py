@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING
 
-from dipn_jax import console
+from dipn_jax import console, files
 from dipn_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Tables:
 
         if self.cases == "random":
             return None
-        return case_files.hard_cases_path() if self.cases == "hard" else pathlib.Path(self.cases)
+        return case_files.hard_cases_path() if self.cases == "hard" else files.absolute(self.cases)
 
     def slots(self) -> int:
         """Return the largest number of objects on one of the tables."""

@@ -24,6 +24,7 @@ def grasp(
     seed: int = 1_000_000,
     others: int = 0,
     engine: EngineName = "auto",
+    threads: int | None = None,
     ranges: Ranges = DEFAULT_RANGES,
 ) -> None:
     """Measure how often the best-scored grasp holds until the tables are empty, and how often a random one does.
@@ -43,9 +44,10 @@ def grasp(
       seed: random seed of scenes and random grasps; keep it away from the training data's.
       others: where a grasp missed, also try this many of the next best ones, to see what physics allows.
       engine: physics engine.
+      threads: that native simulates on; one a core if not given.
       ranges: the ranges that random objects are drawn from.
     """
-    settings = dict(locals())
+    settings = options.settings(locals())
     options.check(out, seed, scenes=scenes_)
     console.require_between(0, 1024, others=others)
     if not grasp_net and not curve:
@@ -64,7 +66,7 @@ def grasp(
     partial = resume.Partial(out, settings, inputs=[run] if run else [])
     values: dict[str, Any] = curves.grasp_summary(curves.load_grasp_runs(curve))
     if run:
-        physics, scorer = make_engine(engine), scorers.load_scorer(run)
+        physics, scorer = make_engine(engine, threads=threads), scorers.load_scorer(run)
         found, tables = success.evaluate(scorer, physics, config, partial, scenes=scenes_, seed=seed, others=others)
         alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
         values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}

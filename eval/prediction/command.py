@@ -25,6 +25,7 @@ def predict(
     objects: options.Objects = "1:7",
     seed: int = 1_000_000,
     engine: EngineName = "auto",
+    threads: int | None = None,
     physics: bool = True,
     segmented: bool = True,
     ranges: Ranges = DEFAULT_RANGES,
@@ -46,11 +47,12 @@ def predict(
       objects: number of objects in a scene.
       seed: random seed of scenes and pushes; keep it away from the training data's.
       engine: the engine whose result counts as the truth.
+      threads: that native simulates on; one a core if not given.
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
       segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
       ranges: the ranges that random objects are drawn from.
     """
-    settings = dict(locals())
+    settings = options.settings(locals())
     options.check(out, seed, scenes=scenes_)
     if not push_net and not curve:
         raise UserError("prediction: nothing to measure; give --push-net or --curve")
@@ -66,7 +68,7 @@ def predict(
     partial = resume.Partial(out, settings, inputs=runs)
     values, films = push_errors.evaluate(
         networks,
-        make_engine(engine),
+        make_engine(engine, threads=threads),
         config,
         partial,
         scenes=scenes_,
@@ -111,4 +113,4 @@ def _save_pictures(out: pathlib.Path, films: dict[str, np.ndarray], values: dict
     np.savez_compressed(out / "films.npz", **films)  # type: ignore[arg-type]
     for which in ("all", "moved") if curve else ():
         curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
-        files.write_atomically(out / f"curve-{which}.md", curves.push_table(values, which=which).encode())
+        files.write_text(out / f"curve-{which}.md", curves.push_table(values, which=which))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from dipn_jax import files
+from dipn_jax.errors import UserError
 
 from .. import drawing, metrics
 from ..clearing import film, lockstep
@@ -49,10 +49,21 @@ class Cleared:
 
 
 def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
-    """Return metrics for the report as `clear/TABLES/METHOD/...`, or `clear/TABLES/LABEL/METHOD/...` with a label."""
+    """Return metrics for the report as `clear/TABLES/METHOD/...`, or `clear/TABLES/LABEL/METHOD/...` with a label.
+
+    Raises:
+      UserError: two folders are of the same tables, method and label.
+    """
     values: dict[str, Any] = {}
+    folders: dict[str, pathlib.Path] = {}
     for one in all_cleared:
         at = "/".join(filter(None, ("clear", one.tables, one.label, one.method)))
+        if at in folders:
+            raise UserError(
+                f"--clear {folders[at]} {one.folder}: both are {one.name} on {one.tables}; give one of them, or clear "
+                "again with another --label"
+            )
+        folders[at] = one.folder
         values |= {f"{at}/{key}": value for key, value in one.values.items()}
     return values
 
@@ -62,15 +73,15 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     parts, figures = ["<h2>Clearing tables</h2>"], {}
     for tables in dict.fromkeys(one.tables for one in all_cleared):
         rows = [one for one in all_cleared if one.tables == tables]
-        parts.append(f"<h3>{html.escape(tables)}</h3>{_table(rows, paper.TABLE.get(tables, {}))}")
+        parts.append(f"<h3>{drawing.escaped(tables)}</h3>{_table(rows, paper.TABLE.get(tables, {}))}")
         parts.append(f"<p>Why tables were not cleared:</p>{_causes(rows)}{{course-{tables}}}")
         figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
             place = f"clear-{tables}-{number}"
             figures[place] = _films(one)
             parts.append(
-                f"<h4>{html.escape(one.name)} on {html.escape(tables)}: the best, the median and the worst table</h4>"
-                f"{{{place}}}"
+                f"<h4>{drawing.escaped(one.name)} on {drawing.escaped(tables)}: "
+                f"the best, the median and the worst table</h4>{{{place}}}"
             )
     parts.append(
         "<p class=note>Per cent, with bootstrap 95 % intervals over tables; the numbers of the paper are of its own "
@@ -134,7 +145,7 @@ def _courses(rows: list[Cleared]) -> Any:
     figure, axis = plt.subplots(figsize=(6, 3.5))
     at = np.linspace(0, lockstep.ACTIONS_PER_OBJECT, 61)
     for one in rows:
-        axis.plot(at, 100 * course(one, at), label=one.name)
+        axis.plot(at, 100 * course(one, at), label=drawing.label(one.name))
     axis.plot(at, 100 * np.maximum(1 - at, 0), color="0.7", lw=1, ls=":", label="an object an action")
     axis.set(xlabel="actions an object", ylabel="objects left, %", ylim=(0, 102))
     axis.grid(alpha=0.3)
@@ -160,7 +171,7 @@ def _films(one: Cleared) -> Any:
             axis.axis("on")
             drawing.show(axis, reel.before(i), f"{i + 1}: {reel.what[i]}")
             _draw(axis, reel, i)
-        axes[row, 0].set_ylabel(f"{which}: {entry['name']}\n{entry['ended']}", fontsize=8)
+        axes[row, 0].set_ylabel(drawing.label(f"{which}: {entry['name']}\n{entry['ended']}"), fontsize=8)
     figure.tight_layout(pad=0.4)
     return figure
 

@@ -57,7 +57,7 @@ def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>dipn-jax report</title><style>{_STYLE}</style>'
         f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {html.escape(versions)}.</p></html>\n'
     )
-    files.write_atomically(out / "report.html", page.encode())
+    files.write_text(out / "report.html", page)
     files.write_json(out / "metrics.json", values)
     return values
 
@@ -147,13 +147,15 @@ def _curves(runs: Sequence[pathlib.Path]) -> Any:
     figure, axes = plt.subplots(1, len(runs), figsize=(4 * len(runs), 3), squeeze=False)
     for axis, run in zip(axes[0], runs, strict=True):
         try:
-            lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-        except (OSError, json.JSONDecodeError):
+            lines = [json.loads(line) for line in files.read_text(run / "metrics.jsonl").splitlines()]
+        except (OSError, ValueError):
             raise UserError(f"{run}: no readable metrics.jsonl; give the --out of a dipn-train command") from None
         for key in dict.fromkeys(k for line in lines for k in line if k != "step"):
             some = [line for line in lines if key in line]
-            axis.plot([line["step"] for line in some], [line[key] for line in some], marker=".", label=key)
-        axis.set(title=run.name, xlabel="steps", yscale="log")
+            axis.plot(
+                [line["step"] for line in some], [line[key] for line in some], marker=".", label=drawing.label(key)
+            )
+        axis.set(title=drawing.label(run.name), xlabel="steps", yscale="log")
         axis.legend(fontsize=7)
         axis.grid(alpha=0.3)
     return figure

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import pathlib
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from dipn_jax.datagen.generate import Job, generate
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
+from dipn_jax.physics import native
 from dipn_jax.storage import records, shards
 from dipn_jax.world import scenes
 
@@ -51,6 +53,24 @@ def test_a_shard_is_the_same_by_another_worker(copy: pathlib.Path, tmp_path: pat
     generate(JOB, other, part=1, of=2)
     assert sorted(p.name for p in other.glob("*.parquet")) == ["shard-00001.parquet"]
     assert shards.shard_path(other, 1).read_bytes() == shards.shard_path(copy, 1).read_bytes()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_any_number_of_threads_makes_the_same_bytes(
+    threads: int, copy: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[int] = []
+    made = native.NativeEngine.__init__
+
+    def spied(self: native.NativeEngine, *args: Any, **named: Any) -> None:
+        made(self, *args, **named)
+        used.append(self.threads)
+
+    monkeypatch.setattr(native.NativeEngine, "__init__", spied)
+    generate(JOB, tmp_path / "own", threads=threads)
+    assert used == [threads]
+    for name in ("config.json", "manifest.json", *(f"shard-{i:05d}.parquet" for i in range(2))):
+        assert (tmp_path / "own" / name).read_bytes() == (copy / name).read_bytes(), name
 
 
 def test_a_gap_is_filled_with_the_same_bytes_and_the_rest_left_alone(copy: pathlib.Path) -> None:

@@ -26,3 +26,43 @@ def test_a_commit_is_marked_where_a_python_file_differs(
 
 def test_a_machine_has_a_processor_and_cores() -> None:
     assert machine.processor() and machine.cores() >= 1
+
+
+@pytest.fixture
+def many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine of 64 cores."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(64))
+
+
+def _written(path: pathlib.Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("files", "group", "count"),
+    [
+        ({}, None, 64),
+        ({"cpu.max": "max 100000\n"}, "0::/\n", 64),
+        ({"cpu.max": "250000 100000\n"}, "0::/\n", 2),
+        ({"cpu.max": "50000 100000\n"}, None, 1),
+        ({"cpu.max": "9900000 100000\n"}, "0::/\n", 64),
+        ({"cpu.max": "damaged"}, "0::/\n", 64),
+        ({"a/b/cpu.max": "max 100000\n", "a/cpu.max": "300000 100000\n"}, "0::/a/b\n", 3),
+        ({"cpu/cpu.cfs_quota_us": "400000\n", "cpu/cpu.cfs_period_us": "100000\n"}, None, 4),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, None, 64),
+        (
+            {"cpu,cpuacct/job/cpu.cfs_quota_us": "500000\n", "cpu,cpuacct/job/cpu.cfs_period_us": "100000\n"},
+            "7:cpuset:/\n4:cpu,cpuacct:/job\n",
+            5,
+        ),
+    ],
+)
+def test_a_containers_quota_is_heeded(
+    files: dict[str, str], group: str | None, count: int, many: None, tmp_path: pathlib.Path
+) -> None:
+    for name, text in files.items():
+        _written(tmp_path / "groups" / name, text)
+    if group is not None:
+        _written(tmp_path / "own" / "cgroup", group)
+    assert machine.cores(groups=tmp_path / "groups", own=tmp_path / "own") == count

@@ -1,6 +1,8 @@
 import json
 import pathlib
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -122,3 +124,13 @@ def test_a_manifest_without_some_of_its_keys_is_damaged(copy: pathlib.Path, gone
     for look in (records.verify, records.summary):
         with pytest.raises(UserError, match=r"manifest\.json is damaged; run dipn-datagen repair"):
             look(copy)
+
+
+def test_where_files_cannot_be_locked_the_manifest_is_written_all_the_same(tmp_path: pathlib.Path) -> None:
+    script = (
+        "import pathlib, sys; sys.modules['fcntl'] = None\n"  # as where there is no such module
+        "from dipn_jax.storage import records\n"
+        "assert records.update_manifest(pathlib.Path(sys.argv[1]))['episodes'] == 0"
+    )
+    subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
+    assert (tmp_path / records.MANIFEST).is_file()

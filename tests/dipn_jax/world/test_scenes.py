@@ -113,3 +113,12 @@ def test_sizes_stay_within_bounds_whatever_the_scale() -> None:
     )
     assert size.min() >= scenes.MIN_SIDE - 1e-7
     assert np.linalg.norm(size, axis=-1).max() <= shapes.MAX_DIAGONAL + 1e-6
+
+
+def test_a_card_that_the_gripper_cannot_reach_is_refused_as_it_lies(tmp_path: pathlib.Path) -> None:
+    card: dict[str, Any] = {"size_mm": [85, 54, 5]}
+    for low in ({}, {"size_mm": [85, 54, 19]}, {"height_m": 0.01}):
+        with pytest.raises(UserError, match=r"case a, object 0: is \d+ mm high as it lies, below the gripper's reach"):
+            cases.load_cases(_file(tmp_path, **card | low))
+    for reached in ({"quaternion_wxyz": [1, 1, 0, 0]}, {"size_mm": [85, 54, 25]}, {"height_m": 0.06}):
+        cases.load_cases(_file(tmp_path, **card | reached))

@@ -1,12 +1,17 @@
+import html.parser
 import json
 import pathlib
+import shutil
 from typing import Any
 
 import numpy as np
+import pytest
 from dipn_jax.eval import metrics
 from dipn_jax.eval.prediction import push_errors
 from dipn_jax.eval.report import page
 
+from dipn_jax import files
+from dipn_jax.errors import UserError
 from dipn_jax.storage import checkpoint
 from dipn_jax.storage.resume import Partial
 from dipn_jax.world import scenes
@@ -42,3 +47,55 @@ def test_the_report_is_one_file_with_its_pictures(
         json.loads((tmp_path / "metrics.json").read_text())["push_error/dipn/5cm/all"]
         == values["push_error/dipn/5cm/all"]
     )
+
+
+NASTY = (r"$\frac{$ <script>alert(1)</script>", "\"'><img src=x onerror=y> {steps}", "price: $5$ \udcc3\udca4")
+"""What users may call things: formulas that are none, markup, places of figures, bytes that are no text."""
+
+
+class _Tags(html.parser.HTMLParser):
+    """The tags of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.add(tag)
+        assert tag != "img" or dict(attrs)["src"].startswith("data:image/png;base64,")  # type: ignore[union-attr]
+
+
+def _renamed(folder: pathlib.Path, name: str) -> pathlib.Path:
+    """Call the cases, the case file and the label of what was cleared `name`."""
+    settings = files.read_json(folder / "settings.json")
+    named = {"label": name, "tables.cases": f"my/{name.replace('/', '-')}.json"}
+    files.write_json(folder / "settings.json", settings | named)
+    entries = files.read_json(folder / "episodes.json", wanted=list)
+    files.write_json(folder / "episodes.json", [entry | {"name": name, "ended": "fault"} for entry in entries])
+    return folder
+
+
+@pytest.mark.parametrize("name", NASTY)
+def test_what_users_named_is_text_in_pages_and_figures(name: str, cleared: Any, tmp_path: pathlib.Path) -> None:
+    folder = _renamed(pathlib.Path(shutil.copytree(cleared[1], tmp_path / "c")), name)
+    run = tmp_path / name.replace("/", "-")
+    run.mkdir()
+    (run / "metrics.jsonl").write_text('{"step": 1, "loss": 1.0}\n')
+    page.write(tmp_path, page.Sources(clears=[folder], runs=[run]))
+    text = (tmp_path / "report.html").read_bytes().decode("utf-8")
+    tags = _Tags()
+    tags.feed(text)
+    ours = {"html", "meta", "title", "style", "h1", "h2", "h3", "h4", "p", "table", "tr", "th", "td", "img"}
+    assert tags.found == ours, "none of them comes from a name"
+    assert text.count("data:image/png;base64,") == 4, "each figure stands in its place, once"
+
+
+def test_two_folders_of_one_method_and_label_are_refused(cleared: Any, tmp_path: pathlib.Path) -> None:
+    other = pathlib.Path(shutil.copytree(cleared[1], tmp_path / "other"))
+    with pytest.raises(UserError, match=r"both are dipn.gn on hard; give one of them, or clear again with another"):
+        page.write(tmp_path / "o", page.Sources(clears=[cleared[1], other]))
+    assert not (tmp_path / "o").exists()
+    settings = files.read_json(other / "settings.json")
+    files.write_json(other / "settings.json", settings | {"label": "again"})
+    values = page.write(tmp_path / "o", page.Sources(clears=[cleared[1], other]))
+    assert values["clear/hard/again/dipn+gn/grasps"] == values["clear/hard/dipn+gn/grasps"]

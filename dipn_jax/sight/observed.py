@@ -1,0 +1,69 @@
+"""What a camera of the user's says, checked before anything is computed from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from dipn_jax.errors import UserError
+from dipn_jax.structs import ABSENT
+from dipn_jax.workspace import WORKSPACE
+
+LOWEST, HIGHEST = -0.05, 1.0
+"""Metres above the table between which heights lie; in millimetres, a table with anything on it is higher."""
+
+
+def check_observation(observation: Any) -> None:
+    """Refuse an observation that no network can judge, with one line that says why.
+
+        dipn_jax.check_observation(dipn_jax.Observation(height, color, label, slots=10))
+
+    A policy of `dipn_jax.load_policy` does this by itself; `dipn_jax.decide` and `dipn_jax.imagine` do not.
+
+    Args:
+      observation: a `dipn_jax.Observation` of one table.
+
+    Raises:
+      UserError: a map has another shape or kind of number, is not finite, heights are not in metres, colours not in
+        [0, 1], or labels not below `slots`.
+    """
+    side, slots = WORKSPACE.pixels, observation.slots
+    height = _map("height", observation.height, (side, side), np.floating, "metres above the table")
+    color = _map("color", observation.color, (side, side, 3), np.floating, "RGB from 0 to 1")
+    label = _map("label", observation.label, (side, side), np.signedinteger, f"object slots, {ABSENT} on the table")
+    if not isinstance(slots, (int, np.integer)) or slots < 1:
+        raise UserError(f"observation.slots: {slots!r}; want how many objects there may be, a whole number above 0")
+    if height.max() > HIGHEST or height.min() < LOWEST:
+        raise UserError(
+            f"observation.height: {height.min():g} to {height.max():g}; want metres above the table, not millimetres "
+            "and not the distance from the camera"
+        )
+    if color.max() > 1 or color.min() < 0:
+        raise UserError(f"observation.color: {color.min():g} to {color.max():g}; want 0 to 1: divide bytes by 255")
+    if label.max() >= slots or label.min() < ABSENT:
+        raise UserError(
+            f"observation.label: {label.min()} to {label.max()}; want {ABSENT} on the table and less than slots={slots}"
+        )
+
+
+def is_traced(observation: Any) -> bool:
+    """Return whether this is called while a program is traced, when there are no numbers yet."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(observation))
+
+
+def _map(name: str, values: Any, shape: tuple[int, ...], kind: type, about: str) -> np.ndarray:
+    """Return a map as a NumPy array, once its shape and kind are right and it is finite."""
+    array = np.asarray(values)
+    if array.shape != shape:
+        raise UserError(
+            f"observation.{name}: has shape {array.shape}, want {shape}; crop and scale it to the workspace"
+        )
+    if not np.issubdtype(array.dtype, kind) and not (kind is np.floating and array.dtype.name == "bfloat16"):
+        wanted = "floating-point numbers" if kind is np.floating else "whole numbers with a sign"
+        raise UserError(f"observation.{name}: holds {array.dtype}, want {wanted}: {about}")
+    if not np.isfinite(array).all():
+        holes = int((~np.isfinite(array)).sum())
+        raise UserError(f"observation.{name}: {holes} values are NaN or infinite; fill holes before, say with 0")
+    return array

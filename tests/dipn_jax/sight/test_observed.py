@@ -1,0 +1,79 @@
+import copy
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import dipn_jax
+from dipn_jax.planning.methods import Policy
+from dipn_jax.planning.planner import Rule
+
+SIDE = (224, 224)
+
+
+def _seen(**changes: Any) -> dipn_jax.Observation:
+    """An empty table, but for what is changed, of any kind."""
+    good = dipn_jax.Observation(
+        np.zeros(SIDE, np.float32), np.ones((*SIDE, 3), np.float32), np.full(SIDE, -1, np.int32), slots=3
+    )
+    changed = copy.copy(good)
+    for name, value in changes.items():
+        object.__setattr__(changed, name, value)  # without the checks that tests alone have
+    return changed
+
+
+def _with(value: float, where: int = 7) -> np.ndarray:
+    height = np.zeros(SIDE, np.float32)
+    height[where, where] = value
+    return height
+
+
+BAD = {
+    "height: has shape (480, 640)": {"height": np.zeros((480, 640), np.float32)},
+    "height: has shape (1, 224, 224)": {"height": np.zeros((1, *SIDE), np.float32)},
+    "height: holds uint16, want floating-point": {"height": np.zeros(SIDE, np.uint16)},
+    "height: 1 values are NaN or infinite": {"height": _with(np.nan)},
+    "height: 0 to 45; want metres above the table, not millimetres": {"height": _with(45.0)},
+    "height: -0.7 to 0; want metres": {"height": _with(-0.7)},
+    "color: holds uint8": {"color": np.zeros((*SIDE, 3), np.uint8)},
+    "color: 255 to 255; want 0 to 1": {"color": np.full((*SIDE, 3), 255, np.float32)},
+    "color: has shape (224, 224, 4)": {"color": np.ones((*SIDE, 4), np.float32)},
+    "label: holds float32": {"label": np.zeros(SIDE, np.float32)},
+    "label: 3 to 3; want -1 on the table and less than slots=3": {"label": np.full(SIDE, 3, np.int32)},
+    "label: -2 to -2": {"label": np.full(SIDE, -2, np.int32)},
+    "slots: 0; want": {"slots": 0},
+}
+
+
+def _act(*_: Any) -> Any:
+    return "decided"
+
+
+POLICY = Policy(_act, Rule(), np.array([0.1], np.float32))
+
+
+@pytest.mark.parametrize("says", BAD)
+def test_what_no_network_can_judge_is_refused_in_one_line(says: str) -> None:
+    bad = _seen(**BAD[says])
+    with pytest.raises(dipn_jax.UserError) as refused:
+        dipn_jax.check_observation(bad)
+    assert str(refused.value).startswith(f"observation.{says}") and "\n" not in str(refused.value)
+
+
+def test_a_policy_refuses_it_before_it_decides() -> None:
+    for bad in (_seen(height=_with(np.nan)), _seen(height=_with(45.0)), _seen(label=np.full(SIDE, 3, np.int32))):
+        with pytest.raises(dipn_jax.UserError, match=r"^observation\."):
+            POLICY(jax.random.key(0), bad)
+
+
+def test_what_a_camera_sees_passes() -> None:
+    noisy = _seen(height=_with(-0.004), label=np.full(SIDE, 2, np.int64))
+    for good in (_seen(), noisy, jax.tree.map(jax.numpy.asarray, _seen())):
+        dipn_jax.check_observation(good)
+        assert POLICY(jax.random.key(0), good) == "decided"
+
+
+def test_a_policy_can_be_traced() -> None:
+    policy = Policy(lambda key, seen, *_: seen.height.sum(), Rule(), np.array([0.1], np.float32))
+    assert jax.jit(lambda seen: policy(jax.random.key(0), seen))(_seen()) == 0

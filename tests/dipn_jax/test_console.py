@@ -1,0 +1,101 @@
+"""What the commands share: paths as users give them."""
+
+import pathlib
+import pickle
+from typing import Any
+
+import pytest
+from dipn_jax.datagen import cli as datagen_cli
+from dipn_jax.eval import cli as eval_cli
+from dipn_jax.eval.clearing.tables import Tables
+from dipn_jax.train import cli as train_cli
+
+from dipn_jax import console, files
+from dipn_jax.errors import UserError
+from dipn_jax.storage import resume
+from dipn_jax.world import cases
+
+EVERY = {
+    f"{stage.__name__}.{name}": (stage.COMMANDS, name, command)
+    for stage in (datagen_cli, train_cli, eval_cli)
+    for name, command in stage.COMMANDS.items()
+}
+
+
+@pytest.fixture
+def home(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
+    """A home folder of its own, and another folder as the one that we are in."""
+    (tmp_path / "home").mkdir()
+    (tmp_path / "here").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "home"
+
+
+def _paths(value: Any) -> list[pathlib.Path]:
+    return [value] if isinstance(value, pathlib.Path) else [p for v in value for p in _paths(v)] if value else []
+
+
+@pytest.mark.parametrize("which", EVERY)
+def test_every_path_of_every_command_is_absolute_when_it_begins(
+    which: str, home: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands, name, command = EVERY[which]
+    hints = {key: str(kind) for key, kind in command.__annotations__.items()}
+    wanted = {key: kind for key, kind in hints.items() if "pathlib.Path" in kind}
+    assert wanted
+    seen: dict[str, Any] = {}
+
+    def called(*positional: Any, **named: Any) -> None:
+        seen.update(dict(zip(hints, positional, strict=False)) | named)
+
+    called.__dict__.update(__doc__=command.__doc__, __wrapped__=command)
+    arguments = [name]
+    for key, kind in wanted.items():
+        shown = {"clears": "clear", "predictions": "prediction", "grasps": "grasp", "sweeps": "sweep"}.get(key, key)
+        option = [] if "Positional" in kind else [f"--{shown.replace('_', '-')}"]
+        arguments += [*option, "~/lit", *(["there/x"] if "tuple" in kind else [])]
+    assert console.run("test", commands | {name: called}, arguments) == 0
+    for key, kind in wanted.items():
+        expected = [home / "lit", *([pathlib.Path.cwd() / "there" / "x"] if "tuple" in kind else [])]
+        assert _paths(seen[key]) == expected, key
+
+
+def test_builtin_is_a_name_and_stays_one(home: pathlib.Path) -> None:
+    assert files.with_absolute_paths(pathlib.Path("builtin")) == pathlib.Path("builtin")
+    assert files.with_absolute_paths(Tables("random")) == Tables("random")
+
+
+def test_a_home_that_is_not_there_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    command = ["info", "~nobody-of-that-name/data"]
+    assert console.run("test", datagen_cli.COMMANDS, command) == 2
+    error = capfd.readouterr().err
+    assert error == f"error: {command[1]}: there is no home folder for ~; give the folder's full path\n"
+
+
+def test_a_user_without_a_home_has_no_cache_and_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    console.enable_compilation_cache()
+
+
+def test_a_case_file_is_found_below_home(home: pathlib.Path) -> None:
+    (home / "mine.json").write_bytes(cases.hard_cases_path().read_bytes())
+    tables = Tables("~/mine.json")
+    assert tables.path() == home / "mine.json" and tables.slots() == 6
+    assert len(cases.load_cases("~/mine.json")[0]) == 10
+    with pytest.raises(UserError, match=str(home / "gone")):
+        files.read_json(files.absolute("~/gone"))
+
+
+def test_work_begun_with_paths_as_they_were_given_goes_on(tmp_path: pathlib.Path) -> None:
+    """Paths were a part of what unfinished work is known by, as they were typed; now what they lead to is."""
+    before = {"out": "results/hard", "grasp_net": "runs/gn", "seed": 3, "tables.cases": "mine.json"}
+    now = {"out": tmp_path, "grasp_net": tmp_path / "gn", "seed": 3, "tables.cases": tmp_path / "mine.json"}
+    resume.Partial(tmp_path, before).save("half")
+    assert resume.Partial(tmp_path, now).load(None) == "half"
+    assert resume.Partial(tmp_path, now | {"seed": 4}).load(None) is None
+    resume.Partial(tmp_path, now).save("more")
+    assert resume.Partial(tmp_path, now | {"out": tmp_path / "moved"}).load(None) == "more"
+    (tmp_path / "partial.pickle").write_bytes(pickle.dumps(("not JSON", "x")))
+    assert resume.Partial(tmp_path, now).load(None) is None
