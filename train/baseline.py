@@ -27,7 +27,7 @@ from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
 
-from . import acting, tables
+from . import acting, finite, tables
 from .acting import Look
 from .configs import BaselineConfig
 from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, view, windows
@@ -104,7 +104,7 @@ def learn(
       Mean reward of all and of the last pushes and grasps.
 
     Raises:
-      UserError: the folder holds another run, or there is no scorer for `dqn`.
+      UserError: the folder holds another run, there is no scorer for `dqn`, or a loss is not finite.
     """
     if (config.method == "dqn") != (scorer is not None):
         raise UserError(
@@ -204,9 +204,18 @@ def _update(state: State, step: Callable[..., Any], config: BaselineConfig) -> t
     rng = np.random.default_rng([config.seed, state.round, 1])
     key = jax.random.fold_in(jax.random.key(config.seed + 1), state.round)
     params, rest, moments = jax.tree.map(jnp.array, (state.params, state.rest, state.moments))
-    for k in range(config.updates):
-        batch = {n: structs.take(some, rng.integers(len(some.target), size=config.batch)) for n, some in seen.items()}
-        params, rest, moments, _ = step(params, rest, moments, batch, jax.random.fold_in(key, k))
+    drawn = [
+        {n: rng.integers(len(some.target), size=config.batch) for n, some in seen.items()}
+        for _ in range(config.updates)
+    ]
+    watch = finite.Watch(
+        config.learning_rate, lambda k: np.concatenate(list(drawn[k].values())), f"round {state.round} of learning"
+    )
+    for k, index in enumerate(drawn):
+        batch = {n: structs.take(some, index[n]) for n, some in seen.items()}
+        params, rest, moments, loss = step(params, rest, moments, batch, jax.random.fold_in(key, k))
+        watch.see(k, loss)
+    watch.check(config.updates, (params, rest, moments))
     return jax.device_get((params, rest, moments))
 
 
@@ -225,4 +234,6 @@ def _log(out: pathlib.Path, config: BaselineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of actions after each round, and mean rewards of the last of them."""
     counts = range(config.tables, len(state.did) + 1, config.tables)
     rows = [{"step": n, **_rewards(state.did[:n], RECENT_ACTIONS)} for n in counts]
-    files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
+    files.write_atomically(
+        out / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
+    )

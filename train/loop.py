@@ -20,6 +20,7 @@ from dipn_jax import console, files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import checkpoint
 
+from . import finite
 from .configs import BaselineConfig, OnlineConfig, TrainConfig
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
@@ -111,7 +112,8 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
       The last evaluation.
 
     Raises:
-      UserError: the folder holds a run of another config or on other data.
+      UserError: the folder holds a run of another config or on other data; or a loss or a weight is not finite,
+        after which nothing is saved.
     """
     _check(config, out)
     optimizer = make_optimizer(config)
@@ -124,6 +126,7 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
     log = _Log(out, begin)
     key = jax.random.key(config.seed)
     latest: dict[str, float] = {}
+    watch = finite.Watch(config.learning_rate, lambda k: np.asarray(order[k]), "the last finite checkpoint is kept")
 
     def save(step: int) -> None:
         parts = {"model": nnx.state(nnx.merge(graph, params, rest)), "train": moments}
@@ -142,13 +145,19 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
         while step < config.steps:
             batch = task.fetch(np.asarray(order[step]))
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
+            watch.see(step, loss)
             step += 1
-            if step % config.eval_every == 0 or step == config.steps:
+            evaluating = step % config.eval_every == 0 or step == config.steps
+            saving = step % config.save_every == 0 or step == config.steps or interruption.requested
+            if evaluating or saving:
+                watch.check(step, (params, rest, moments))
+            if evaluating:
                 model = nnx.merge(graph, params, rest)
                 model.eval()
                 latest = {"loss": float(loss), **task.evaluate(model)}
+                watch.check(step, params, **latest)
                 log.write(step, latest)
-            if step % config.save_every == 0 or step == config.steps or interruption.requested:
+            if saving or interruption.requested:
                 save(step)
             if interruption.requested:
                 raise KeyboardInterrupt
@@ -210,7 +219,7 @@ class _Log:
 
     def write(self, step: int, values: dict[str, float]) -> None:
         with self.path.open("a") as stream:
-            stream.write(json.dumps({"step": step, **values}) + "\n")
+            stream.write(json.dumps({"step": step, **values}, allow_nan=False) + "\n")
         for name, value in values.items():
             self.events.add_scalar(name, value, step)
 

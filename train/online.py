@@ -24,7 +24,7 @@ from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
 from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
 
-from . import tables
+from . import finite, tables
 from .configs import OnlineConfig
 from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
 from .loop import constant_adamw, make_step
@@ -63,7 +63,7 @@ def learn(
       Success over all grasps and over the last ones.
 
     Raises:
-      UserError: the network is not compact, or the folder holds another run.
+      UserError: the network is not compact, the folder holds another run, or a loss is not finite.
     """
     if model.config.preset != "compact":
         raise UserError(
@@ -76,6 +76,8 @@ def learn(
     if ended:
         return {name: ended[name] for name in ("success", "success_recent")}
     state = _play(run, model, engine, scenes, config)
+    if not state.success:
+        raise UserError(f"{out}: every simulation failed, so nothing was learnt; give another --engine or --objects")
     nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
     result = {
         "success": float(np.mean(state.success)),
@@ -152,11 +154,14 @@ def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineCon
     seen = structs.concatenate(state.seen)
     rng = np.random.default_rng([config.seed, state.round])
     params, moments = jax.tree.map(jax.numpy.array, (state.params, state.moments))
-    for k in range(config.updates):
-        batch = structs.take(seen, rng.integers(len(seen.target), size=config.batch))
-        params, rest, moments, _ = step(
-            params, jax.tree.map(jax.numpy.array, rest), moments, batch, jax.random.fold_in(key, k)
+    drawn = [rng.integers(len(seen.target), size=config.batch) for _ in range(config.updates)]
+    watch = finite.Watch(config.learning_rate, drawn.__getitem__, f"round {state.round} of learning")
+    for k, index in enumerate(drawn):
+        params, rest, moments, loss = step(
+            params, jax.tree.map(jax.numpy.array, rest), moments, structs.take(seen, index), jax.random.fold_in(key, k)
         )
+        watch.see(k, loss)
+    watch.check(config.updates, (params, moments))
     return jax.device_get((params, moments))
 
 
@@ -164,4 +169,6 @@ def _log(out: pathlib.Path, config: OnlineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of grasps after each round, and success over the last of them."""
     counts = range(config.tables, len(state.success) + 1, config.tables)
     rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT_GRASPS) : n]))} for n in counts]
-    files.write_atomically(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
+    files.write_atomically(
+        out / "metrics.jsonl", "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows).encode()
+    )

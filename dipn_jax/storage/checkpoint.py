@@ -69,29 +69,36 @@ def save(
     final = run.resolve() / "checkpoints" / f"{step:08d}"
     temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    checkpointer = ocp.StandardCheckpointer()
-    for name, tree in parts.items():
-        checkpointer.save(temporary / name, _flat(tree))
-    checkpointer.wait_until_finished()
-    for marker in temporary.rglob("commit_success.txt"):  # Orbax writes the present folder into it
-        marker.write_text("Checkpoint commit was successful\n")
-    stored = sorted(p for p in temporary.rglob("*") if p.is_file())
-    meta = {
-        "format_version": FORMAT_VERSION,
-        "network": network,
-        "network_config": dataclasses.asdict(config),
-        "step": step,
-        "versions": files.package_versions(),
-        "sha256": {str(p.relative_to(temporary)): files.file_sha256(p) for p in stored},
-        **extra,
-    }
-    files.write_json(temporary / "meta.json", meta)
-    shutil.rmtree(final, ignore_errors=True)
-    temporary.rename(final)
+    about = {"network": network, "network_config": dataclasses.asdict(config), "step": step}
+    try:
+        _write(temporary, parts, about, extra)
+        shutil.rmtree(final, ignore_errors=True)
+        temporary.rename(final)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
     for old in older[keep - 1 :]:
         shutil.rmtree(old)
+
+
+def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], extra: Any) -> None:
+    """Write the arrays and the metadata of one step into `folder`."""
+    folder.mkdir(parents=True)
+    checkpointer = ocp.StandardCheckpointer()
+    for name, tree in parts.items():
+        checkpointer.save(folder / name, _flat(tree))
+    checkpointer.wait_until_finished()
+    for marker in folder.rglob("commit_success.txt"):  # Orbax writes the present folder into it
+        marker.write_text("Checkpoint commit was successful\n")
+    stored = sorted(p for p in folder.rglob("*") if p.is_file())
+    meta = {
+        "format_version": FORMAT_VERSION,
+        **about,
+        "versions": files.package_versions(),
+        "sha256": {str(p.relative_to(folder)): files.file_sha256(p) for p in stored},
+        **extra,
+    }
+    files.write_json(folder / "meta.json", meta)
 
 
 def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:

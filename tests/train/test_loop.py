@@ -70,6 +70,49 @@ def test_a_folder_belongs_to_one_run(task: PushTask, tmp_path: pathlib.Path) -> 
         fit(task, TrainConfig(steps=6, batch=2), tmp_path)
 
 
+def _refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def test_a_loss_that_is_not_finite_ends_a_run_at_the_last_finite_checkpoint(
+    task: PushTask, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetched: list[np.ndarray] = []
+    fetch = task.fetch
+
+    def spoilt(index: np.ndarray) -> Any:
+        fetched.append(index)
+        batch = fetch(index)
+        return batch.replace(target=batch.target * np.float32("nan")) if len(fetched) == 3 else batch
+
+    monkeypatch.setattr(task, "fetch", spoilt)
+    plan = TrainConfig(steps=8, batch=4, eval_every=2, save_every=2)
+    with pytest.raises(UserError, match=r"^step 3: the loss is not finite at --learning-rate 0\.001, ex") as told:
+        fit(task, plan, tmp_path)
+    named = str(told.value).split("examples ")[1].split(";")[0]
+    assert [int(n) for n in named.split()] == fetched[2].tolist()
+    assert checkpoint.newest(tmp_path)[1]["step"] == 2  # type: ignore[index]
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["00000002"]
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line, parse_constant=_refuse)["step"] for line in lines] == [2]
+
+
+def test_weights_that_overflow_are_not_saved(task: PushTask, tmp_path: pathlib.Path) -> None:
+    plan = TrainConfig(steps=1, batch=4, learning_rate=1e39, optimizer="sgd")
+    with pytest.raises(UserError, match="step 1: a weight is not finite"):
+        fit(task, plan, tmp_path)
+    assert checkpoint.newest(tmp_path) is None and not (tmp_path / "metrics.jsonl").read_text()
+
+
+@pytest.mark.slow
+def test_learning_online_stops_at_a_loss_that_is_not_finite(engine: Any, tmp_path: pathlib.Path) -> None:
+    plan = online.OnlineConfig(grasps=6, tables=2, updates=2, batch=4, learning_rate=1e39)
+    network = GraspConfig(width=8, coarse=8, blocks=1)
+    with pytest.raises(UserError, match="not finite"):
+        online.learn(checkpoint.build("grasp", network), engine, scenes.fixed_count(3, spread=0.2), plan, tmp_path)
+    assert not (tmp_path / "checkpoints").exists()
+
+
 def _loss(task: Any, model: nnx.Module, count: int) -> float:
     """Loss on the first `count` training examples."""
     graph, state = nnx.split(model)
