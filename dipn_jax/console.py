@@ -118,6 +118,11 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
+def warn(text: str) -> None:
+    """One line for the user, on standard error, about what goes on in spite of it."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)
+
+
 def require_positive(**values: float) -> None:
     """UserError for the first value that is not a finite number above zero."""
     for name, value in values.items():

@@ -23,7 +23,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
 
@@ -42,6 +42,7 @@ RECENT_ACTIONS = 100
 """The number of last actions over which rewards are averaged."""
 
 
+@plain.register
 @dataclasses.dataclass
 class State:
     """Everything that an interrupted run needs to continue."""
@@ -146,7 +147,8 @@ def _play(
         return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT_ACTIONS).items())
 
     total, log = -(-config.actions // config.tables), functools.partial(_log, run.out, config)
-    return run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
+    trees = {"params": weights, "rest": statistics, "moments": jax.eval_shape(optimizer.init, weights)}
+    return run.play(fresh, act, total=total, what=f"act and learn {config.method}", trees=trees, log=log)
 
 
 def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, scored_by: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspNet, score_image
 from dipn_jax.planning import candidates
 from dipn_jax.sight import render
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
 from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
@@ -35,6 +35,7 @@ RECENT_GRASPS = 50
 """The number of last grasps over which success is counted."""
 
 
+@plain.register
 @dataclasses.dataclass
 class State:
     """Everything that an interrupted run needs to continue."""
@@ -105,8 +106,9 @@ def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config
         state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
         return f"{np.mean(state.success[-RECENT_GRASPS:]):.2f} of the last {RECENT_GRASPS} held"
 
-    log = functools.partial(_log, run.out, config)
-    return run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
+    log, total = functools.partial(_log, run.out, config), -(-config.grasps // config.tables)
+    trees = {"params": weights, "moments": jax.eval_shape(optimizer.init, weights)}
+    return run.play(fresh, act, total=total, what="grasp and learn", trees=trees, log=log)
 
 
 class _Outcomes:

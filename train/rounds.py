@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
+import jax
 from flax import nnx
 
 from dipn_jax import console, files
@@ -13,8 +15,9 @@ from dipn_jax.storage import checkpoint, resume
 
 
 class State(Protocol):
-    """State of a run after some rounds; it can be pickled."""
+    """State of a run after some rounds: a dataclass that `plain` has registered."""
 
+    __dataclass_fields__: ClassVar[dict[str, Any]]
     round: int
 
 
@@ -28,7 +31,7 @@ class Run:
         """Claim the folder.
 
         Args:
-          out: folder: `config.json`, `checkpoints/`, and `partial.pickle` until the end.
+          out: folder: `config.json`, `checkpoints/`, and `partial.npz` until the end.
           identity: everything that determines the result of the run.
 
         Raises:
@@ -50,6 +53,7 @@ class Run:
         *,
         total: int,
         what: str,
+        trees: dict[str, Any],
         log: Callable[[S], None] = lambda _: None,
     ) -> S:
         """Act until `total` rounds are done.
@@ -59,16 +63,22 @@ class Run:
           act: does one round in place; returns a note for the progress line.
           total: number of rounds.
           what: title of the progress.
+          trees: fields of the state that hold pytrees of arrays of any structure, such as an optimizer's, by name: a
+            pytree of the same structure.
           log: writes the results of the rounds so far; it depends on the state alone.
         """
         state: S | None = self._partial.load(None)
         if state is None:
             state = fresh()
+        else:
+            for name, like in trees.items():
+                setattr(state, name, jax.tree.unflatten(jax.tree.structure(like), getattr(state, name)))
         with console.Progress(what, total, unit="rounds", done=state.round) as progress:
             while state.round < total:
                 note = act(state)
                 state.round += 1
-                self._partial.save(state)
+                leaves: Any = {name: jax.tree.leaves(getattr(state, name)) for name in trees}
+                self._partial.save(dataclasses.replace(state, **leaves))
                 log(state)
                 progress.advance(1, note)
         log(state)  # again, in case the run was interrupted between saving and logging its last round

@@ -11,6 +11,7 @@ import numpy as np
 from dipn_jax import structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
+from dipn_jax.storage import plain
 from dipn_jax.structs import Fault, Scene
 from dipn_jax.world import cases as case_files
 from dipn_jax.world import clutter, primitives, scenes
@@ -21,6 +22,7 @@ MASS_FACTOR, FRICTION_FACTOR = (0.8, 1.2), (0.85, 1.15)
 """By which those of its objects are multiplied."""
 
 
+@plain.register
 @dataclasses.dataclass
 class Instance:
     """One table being cleared."""
