@@ -113,18 +113,18 @@ def learn(
         )
     network = VpgConfig(config.preset, LEARNT_PARTS[config.method], "chance" if config.method == "rea" else "value")
     model: Any = checkpoint.build("vpg", network, seed=config.seed)
-    run = Run(out, _identity(engine, scenes, config, scored_by))
-    ended = run.ended()
-    if ended:
-        return {name: value for name, value in ended.items() if name.startswith("reward/")}
-    state = _play(run, model, engine, scenes, config, scorer)
-    nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
-    result = _rewards(state.did, len(state.did)) | {
-        f"{k}/recent": v for k, v in _rewards(state.did, RECENT_ACTIONS).items()
-    }
-    extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
-    run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
-    return result
+    with Run(out, _identity(engine, scenes, config, scored_by)) as run:
+        ended = run.ended()
+        if ended:
+            return {name: value for name, value in ended.items() if name.startswith("reward/")}
+        state = _play(run, model, engine, scenes, config, scorer)
+        nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
+        result = _rewards(state.did, len(state.did)) | {
+            f"{k}/recent": v for k, v in _rewards(state.did, RECENT_ACTIONS).items()
+        }
+        extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
+        run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
+        return result
 
 
 def _play(

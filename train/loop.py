@@ -18,7 +18,7 @@ from flax import nnx
 
 from dipn_jax import console, files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, owner
 
 from . import finite
 from .configs import BaselineConfig, OnlineConfig, TrainConfig
@@ -112,11 +112,23 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
       The last evaluation.
 
     Raises:
-      UserError: the folder holds a run of another config or on other data; or a loss or a weight is not finite,
-        after which nothing is saved.
+      UserError: the folder holds a run of another config or on other data, or another process has it; or a loss or
+        a weight is not finite, after which nothing is saved.
     """
     _check(config, out)
     optimizer = make_optimizer(config)
+    with owner.owned(out):
+        return _fit(task, config, out, optimizer, initial)
+
+
+def _fit(
+    task: Task,
+    config: TrainConfig,
+    out: pathlib.Path,
+    optimizer: optax.GradientTransformation,
+    initial: nnx.Module | None,
+) -> dict[str, float]:
+    """Train in a folder that this process owns; arguments as of `fit`."""
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
     files.claim(out, _identity(task, config, initial))
     moments, begin = _resume(out, model, optimizer)

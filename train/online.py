@@ -72,21 +72,23 @@ def learn(
             "dipn-train grasp"
         )
     identity = {"initial_weights": checkpoint.digest(model), **dataclasses.asdict(config), "scenes": str(scenes)}
-    run = Run(out, identity | {"engine": type(engine).__name__})
-    ended = run.ended()
-    if ended:
-        return {name: ended[name] for name in ("success", "success_recent")}
-    state = _play(run, model, engine, scenes, config)
-    if not state.success:
-        raise UserError(f"{out}: every simulation failed, so nothing was learnt; give another --engine or --objects")
-    nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
-    result = {
-        "success": float(np.mean(state.success)),
-        "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
-    }
-    extra = {"seed": config.seed, "examples": len(state.success), **result}
-    run.finish(model, len(state.success), network="grasp", config=model.config, extra=extra)
-    return result
+    with Run(out, identity | {"engine": type(engine).__name__}) as run:
+        ended = run.ended()
+        if ended:
+            return {name: ended[name] for name in ("success", "success_recent")}
+        state = _play(run, model, engine, scenes, config)
+        if not state.success:
+            raise UserError(
+                f"{out}: every simulation failed, so nothing was learnt; give another --engine or --objects"
+            )
+        nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
+        result = {
+            "success": float(np.mean(state.success)),
+            "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
+        }
+        extra = {"seed": config.seed, "examples": len(state.success), **result}
+        run.finish(model, len(state.success), network="grasp", config=model.config, extra=extra)
+        return result
 
 
 def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> State:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import pathlib
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import jax
 from flax import nnx
 
 from dipn_jax import console, files
-from dipn_jax.storage import checkpoint, resume
+from dipn_jax.storage import checkpoint, owner, resume
 
 
 class State(Protocol):
@@ -25,21 +26,33 @@ S = TypeVar("S", bound=State)
 
 
 class Run:
-    """The folder of a run."""
+    """The folder of a run; it has to be entered (`with`), by which this process owns it."""
 
     def __init__(self, out: pathlib.Path, identity: dict[str, Any]) -> None:
-        """Claim the folder.
+        """Prepare to claim the folder.
 
         Args:
           out: folder: `config.json`, `checkpoints/`, and `partial.npz` until the end.
           identity: everything that determines the result of the run.
+        """
+        self.out, self._identity = out, identity
+        self._owned = contextlib.ExitStack()
+        self._partial = resume.Partial(out, identity)
+
+    def __enter__(self) -> Self:
+        """Own and claim the folder.
 
         Raises:
-          UserError: the folder holds another run.
+          UserError: another process has it, or it holds another run.
         """
-        files.claim(out, identity)
-        self.out = out
-        self._partial = resume.Partial(out, identity)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(owner.owned(self.out))
+            files.claim(self.out, self._identity)
+            self._owned = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._owned.close()
 
     def ended(self) -> dict[str, Any] | None:
         """Return what was saved at the end; None if the run has not ended."""

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from dipn_jax.train import grasp as grasp_task
-from dipn_jax.train import online
+from dipn_jax.train import online, rounds
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
 from dipn_jax.train.push import PushTask
@@ -68,6 +68,20 @@ def test_a_folder_belongs_to_one_run(task: PushTask, tmp_path: pathlib.Path) -> 
     fit(task, BRIEF, tmp_path)
     with pytest.raises(UserError, match="begun with batch=4, asked for batch=2"):
         fit(task, TrainConfig(steps=6, batch=2), tmp_path)
+
+
+def test_a_run_that_is_going_on_is_not_started_again(
+    task: PushTask, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def again(_: np.ndarray) -> Any:
+        return fit(task, BRIEF, tmp_path)
+
+    monkeypatch.setattr(task, "fetch", again)
+    with pytest.raises(UserError, match=f"in use by host .*, pid {os.getpid()}, started"):
+        fit(task, BRIEF, tmp_path)
+    with pytest.raises(UserError, match="in use"), rounds.Run(tmp_path, {}), rounds.Run(tmp_path, {}):
+        pass
+    assert not (tmp_path / "owner.json").exists()
 
 
 def _refuse(constant: str) -> None:
