@@ -8,6 +8,7 @@ reading goes back to the newest step that is whole.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -21,10 +22,12 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import files
+from dipn_jax import console, files
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
 
+WANTED = "give a run (the --out of dipn-train), one step of it (RUN@STEP) or that step's folder (RUN/checkpoints/STEP)"
+"""What is accepted where a network is asked for, for messages."""
 FORMAT_VERSION = 1
 """Version of the format; steps of another version are ignored."""
 NETWORKS: dict[str, tuple[type, type]] = {
@@ -41,7 +44,9 @@ def build(name: str, config: Any, *, seed: int = 0) -> nnx.Module:
 
 
 def _steps(run: pathlib.Path) -> list[pathlib.Path]:
-    """Return the step folders of a run, newest first."""
+    """Return the step folders of a run, newest first; of a step's folder, itself."""
+    if run.name.isdigit() and run.resolve().parent.name == "checkpoints":
+        return [run] if run.is_dir() else []
     folder = run / "checkpoints"
     found = [p for p in folder.iterdir() if p.name.isdigit()] if folder.is_dir() else []
     return sorted(found, key=lambda p: int(p.name), reverse=True)
@@ -127,12 +132,28 @@ def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
 
 
 def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
-    """Return the newest whole step of a run and its metadata; None if there is none."""
-    for folder in _steps(run):
+    """Return the newest whole step of a run and its metadata, None if there is none; a damaged newer one is named."""
+    steps = _steps(run)
+    for number, folder in enumerate(steps):
         meta = _whole(folder)
         if meta is not None:
+            if number:
+                damaged = ", ".join(str(one) for one in steps[:number])
+                _warn_once(f"{damaged}: damaged; step {meta['step']} of {run} is used instead")
             return folder, meta
     return None
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    """Warn, once a process: a command looks for the newest step several times."""
+    console.warn(text)
+
+
+def used(run: pathlib.Path) -> dict[str, Any] | None:
+    """Return step and digest (SHA-256 of the metadata, which has those of all files) of the step that a run loads."""
+    found = newest(run)
+    return found and {"step": found[1]["step"], "digest": files.file_sha256(found[0] / "meta.json")}
 
 
 def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
@@ -198,7 +219,18 @@ def config_from_json(name: str, values: dict[str, Any]) -> Any:
 
 
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
-    """Return the folder of a run; `builtin` stands for the network that comes with the package, if one does."""
+    """Return the folder of a run, or of one step of it where `RUN@STEP` is given.
+
+    `builtin` stands for the network that comes with the package, if one does.
+    """
+    base, at, step = str(run).rpartition("@")
+    if at and step.isdecimal() and not run.exists():
+        steps = _steps(pathlib.Path(base))
+        for folder in steps:
+            if int(folder.name) == int(step):
+                return folder
+        kept = f"it has {', '.join(str(int(p.name)) for p in steps)}" if steps else "it has none"
+        raise UserError(f"checkpoint {run}: no such step of {base}; {kept}")
     if str(run) != "builtin":
         return run
     folder = pathlib.Path(__file__).parents[1] / "data" / network
@@ -222,10 +254,10 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     """
     run = find(pathlib.Path(run), network=network)
     if not run.is_dir():
-        raise UserError(f"checkpoint {run}: no such folder; give the --out of a dipn-train run")
+        raise UserError(f"checkpoint {run}: no such folder; {WANTED}")
     found = newest(run)
     if found is None:
-        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; train again or give another run")
+        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; {WANTED}, or train again")
     folder, meta = found
     if meta["network"] != network:
         raise UserError(f"checkpoint {run}: holds a {meta['network']} network, want {network}; give another run")

@@ -16,7 +16,10 @@ FORMAT_VERSION = 1
 
 
 class Partial:
-    """The state of unfinished work, in `OUT/partial.npz`; one of other settings, inputs or sources is not taken up."""
+    """The state of unfinished work, in `OUT/partial.npz`; one of other settings, inputs or sources is not taken up.
+
+    `networks` holds step and digest of each run among the inputs, by its name.
+    """
 
     def __init__(self, out: pathlib.Path, settings: dict[str, Any], *, inputs: Sequence[pathlib.Path] = ()) -> None:
         """Prepare to load and save the state of work with these settings.
@@ -30,6 +33,7 @@ class Partial:
         content = [_fingerprint(path) for path in inputs]
         named = {k: str(v) for k, v in settings.items()}
         self.identity = json.dumps([FORMAT_VERSION, named, content])
+        self.networks = {str(path): checkpoint.used(path) for path in inputs if not path.is_file()}
         self.code = files.code_digest(*_stages())
 
     def load(self, fresh: Any) -> Any:
@@ -69,5 +73,5 @@ def _fingerprint(path: pathlib.Path) -> str:
     """Return the SHA-256 of a file, or of the newest checkpoint of a run."""
     if path.is_file():
         return files.file_sha256(path)
-    found = checkpoint.newest(path)
-    return files.file_sha256(found[0] / "meta.json") if found else "none"
+    found = checkpoint.used(path)
+    return str(found["digest"]) if found else "none"
