@@ -8,6 +8,7 @@ reading goes back to the newest step that is whole.
 from __future__ import annotations
 
 import dataclasses
+import errno
 import functools
 import hashlib
 import json
@@ -87,12 +88,25 @@ def save(
 
 
 def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], extra: Any) -> None:
-    """Write the arrays and the metadata of one step into `folder`."""
+    """Write the arrays and the metadata of one step into `folder`.
+
+    Raises:
+      UserError: there is no space for it.
+    """
     folder.mkdir(parents=True)
     checkpointer = ocp.StandardCheckpointer()
-    for name, tree in parts.items():
-        checkpointer.save(folder / name, _flat(tree))
-    checkpointer.wait_until_finished()
+    try:
+        for name, tree in parts.items():
+            checkpointer.save(folder / name, _flat(tree))
+        checkpointer.wait_until_finished()
+    except Exception as error:  # TensorStore has errors of its own for what the system says
+        reason = _system_error(error)
+        if reason is None:
+            raise
+        raise UserError(
+            f"{folder.parents[1]}: step {about['step']} cannot be saved ({reason}); earlier steps are whole; make "
+            "space and give the same command to go on"
+        ) from None
     for marker in folder.rglob("commit_success.txt"):  # Orbax writes the present folder into it
         marker.write_text("Checkpoint commit was successful\n")
     stored = sorted(p for p in folder.rglob("*") if p.is_file())
@@ -104,6 +118,13 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
         **extra,
     }
     files.write_json(folder / "meta.json", meta)
+
+
+def _system_error(error: Exception) -> str | None:
+    """Return what the system said, where an error says that the disk is full or cannot be written; None if not."""
+    said = f"{error} {error.__cause__ or ''}"
+    numbers = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
+    return next((os.strerror(n) for n in numbers if getattr(error, "errno", None) == n or os.strerror(n) in said), None)
 
 
 def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:

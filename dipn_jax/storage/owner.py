@@ -11,13 +11,13 @@ import pathlib
 import socket
 from collections.abc import Iterator
 
-from dipn_jax import console
+from dipn_jax import console, files
 from dipn_jax.errors import UserError
 
 
 @contextlib.contextmanager
 def owned(out: pathlib.Path) -> Iterator[None]:
-    """Own a folder, which is made if need be, within a `with` statement.
+    """Own a folder, which is made if need be, within a `with` statement; dead processes' temporary files are deleted.
 
     The file is locked, so that it is free once its owner is dead; where files cannot be locked, it is made exclusively,
     and an owner of this host is looked for.
@@ -32,6 +32,8 @@ def owned(out: pathlib.Path) -> Iterator[None]:
         started = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
         about = {"host": socket.gethostname(), "pid": os.getpid(), "started": started}
         os.write(descriptor, (json.dumps(about) + "\n").encode())
+        for folder in (out, out / "checkpoints"):
+            files.sweep(folder)
         yield
     finally:
         path.unlink(missing_ok=True)
@@ -85,13 +87,7 @@ def _dead(path: pathlib.Path) -> bool:
     pid = owner.get("pid")
     if owner.get("host") != socket.gethostname() or not isinstance(pid, int) or pid <= 0:
         return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return True
-    except OSError:
-        return False
-    return False
+    return not files.alive(pid)
 
 
 def _taken(path: pathlib.Path) -> UserError:

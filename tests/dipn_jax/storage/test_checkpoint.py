@@ -1,5 +1,7 @@
 import json
 import pathlib
+import resource
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -173,3 +175,26 @@ def test_one_step_is_taken_by_its_folder_or_by_its_number(tmp_path: pathlib.Path
         UserError, match=r"no whole step under checkpoints/; give a run .*RUN@STEP.*RUN/checkpoints/STEP"
     ):
         checkpoint.load_network(tmp_path / "checkpoints", network="grasp")
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_litter(tmp_path: pathlib.Path) -> None:
+    _save(tmp_path, 1)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    old = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # no file may grow beyond this: File too large
+        with pytest.raises(UserError, match=r"step 2 cannot be saved \(File too large\)") as told:
+            _save(tmp_path, 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, old)
+    assert "\n" not in str(told.value)
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["00000001"]
+    checkpoint.load_network(tmp_path, network="grasp")
+
+
+@pytest.mark.parametrize("code", ["RESOURCE_EXHAUSTED", "UNKNOWN"])
+def test_what_tensorstore_says_of_a_full_disk_is_understood(code: str) -> None:
+    said = f"{code}: Error writing local file: Failed to write [OS error 28: ENOSPC No space left on device]"
+    assert checkpoint._system_error(ValueError(said)) == "No space left on device"
+    assert checkpoint._system_error(ValueError("another shape")) is None

@@ -62,3 +62,18 @@ def test_without_locks_the_file_is_made_exclusively_and_that_is_said(
     path.write_text(json.dumps({"host": socket.gethostname(), "pid": ended.pid, "started": "today"}))
     with owner.owned(tmp_path / "run"):
         assert json.loads(path.read_text())["pid"] == os.getpid()
+
+
+def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    steps = tmp_path / "checkpoints"
+    for number in (ended.pid, os.getppid()):
+        (steps / f".00000003.{number}.tmp" / "model").mkdir(parents=True)
+        (tmp_path / f".partial.npz.{number}-0a1b2c3d.tmp").touch()
+    (tmp_path / ".mine.tmp").touch()
+    with owner.owned(tmp_path):
+        pass
+    left = {p.name for p in (*tmp_path.iterdir(), *steps.iterdir())}
+    alive = os.getppid()
+    assert left == {"checkpoints", ".mine.tmp", f".00000003.{alive}.tmp", f".partial.npz.{alive}-0a1b2c3d.tmp"}
