@@ -130,7 +130,7 @@ def _fit(
 ) -> dict[str, float]:
     """Train in a folder that this process owns; arguments as of `fit`."""
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
-    files.claim(out, _identity(task, config, initial))
+    _claim(out, _identity(task, config, initial), config)
     moments, begin = _resume(out, model, optimizer)
     graph, params, rest = _split(model)
     order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
@@ -209,6 +209,24 @@ def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> di
     network = {f"network.{k}": v for k, v in dataclasses.asdict(task.network_config).items()}
     data = {"network": task.network, "initial_weights": start, "data": task.fingerprint}
     return {**data, **network, **dataclasses.asdict(config)}
+
+
+def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> None:
+    """Claim the folder; a rate that is constant allows more steps.
+
+    Raises:
+      UserError: the folder holds another run, or one whose rate has fallen for another number of steps.
+    """
+    if config.optimizer == "sgd":
+        return files.claim(out, identity, free=("steps",))
+    path = out / "config.json"
+    begun = files.read_json(path).get("steps", config.steps) if path.exists() else config.steps
+    files.claim(out, identity | {"steps": begun})
+    if begun != config.steps:
+        raise UserError(
+            f"{out}: its learning rate falls to 0 at --steps {begun}, so that it cannot go on to {config.steps}; give "
+            f"--init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
+        )
 
 
 def _step_of(line: str) -> float:

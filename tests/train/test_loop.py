@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import pathlib
@@ -7,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from dipn_jax.train import cli, online, rounds
 from dipn_jax.train import grasp as grasp_task
-from dipn_jax.train import online, rounds
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
 from dipn_jax.train.push import PushTask
@@ -82,6 +83,30 @@ def test_a_run_that_is_going_on_is_not_started_again(
     with pytest.raises(UserError, match="in use"), rounds.Run(tmp_path, {}), rounds.Run(tmp_path, {}):
         pass
     assert not (tmp_path / "owner.json").exists()
+
+
+def test_more_steps_go_on_where_the_rate_is_constant(task: PushTask, tmp_path: pathlib.Path) -> None:
+    plan = dataclasses.replace(BRIEF, steps=2, optimizer="sgd", eval_every=2)
+    more = dataclasses.replace(plan, steps=4)
+    fit(task, plan, tmp_path / "on")
+    fit(task, more, tmp_path / "on")
+    fit(task, more, tmp_path / "whole")
+    for a, b in zip(_weights(tmp_path / "whole"), _weights(tmp_path / "on"), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_refusal_of_more_steps_says_how_and_a_run_starts_from_another(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path
+) -> None:
+    brief = TrainConfig(steps=1, batch=2)
+    cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=brief)
+    begun = checkpoint.load_network("builtin", network="dipn")
+    tuned = checkpoint.load_network(tmp_path / "a", network="dipn")
+    assert tuned.config == begun.config
+    for a, b in zip(*(jax.tree.leaves(nnx.state(one, nnx.Param)) for one in (begun, tuned)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)  # the rate of the first step is 0
+    with pytest.raises(UserError, match=f"falls to 0 at --steps 1, .* --init {tmp_path / 'a'} and another --out"):
+        cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=TrainConfig(steps=2, batch=2))
 
 
 def _refuse(constant: str) -> None:
