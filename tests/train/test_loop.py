@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import cli, online, rounds
 from dipn_jax.train import grasp as grasp_task
+from dipn_jax.train import online, rounds
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
 from dipn_jax.train.push import PushTask
@@ -95,20 +95,6 @@ def test_more_steps_go_on_where_the_rate_is_constant(task: PushTask, tmp_path: p
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_refusal_of_more_steps_says_how_and_a_run_starts_from_another(
-    data: dict[str, pathlib.Path], tmp_path: pathlib.Path
-) -> None:
-    brief = TrainConfig(steps=1, batch=2)
-    cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=brief)
-    begun = checkpoint.load_network("builtin", network="dipn")
-    tuned = checkpoint.load_network(tmp_path / "a", network="dipn")
-    assert tuned.config == begun.config
-    for a, b in zip(*(jax.tree.leaves(nnx.state(one, nnx.Param)) for one in (begun, tuned)), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-6)  # the rate of the first step is 0
-    with pytest.raises(UserError, match=f"falls to 0 at --steps 1, .* --init {tmp_path / 'a'} and another --out"):
-        cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=TrainConfig(steps=2, batch=2))
-
-
 def _refuse(constant: str) -> None:
     raise AssertionError(f"{constant} is no JSON")
 
@@ -141,15 +127,6 @@ def test_weights_that_overflow_are_not_saved(task: PushTask, tmp_path: pathlib.P
     with pytest.raises(UserError, match="step 1: a weight is not finite"):
         fit(task, plan, tmp_path)
     assert checkpoint.newest(tmp_path) is None and not (tmp_path / "metrics.jsonl").read_text()
-
-
-@pytest.mark.slow
-def test_learning_online_stops_at_a_loss_that_is_not_finite(engine: Any, tmp_path: pathlib.Path) -> None:
-    plan = online.OnlineConfig(grasps=6, tables=2, updates=2, batch=4, learning_rate=1e39)
-    network = GraspConfig(width=8, coarse=8, blocks=1)
-    with pytest.raises(UserError, match="not finite"):
-        online.learn(checkpoint.build("grasp", network), engine, scenes.fixed_count(3, spread=0.2), plan, tmp_path)
-    assert not (tmp_path / "checkpoints").exists()
 
 
 def _loss(task: Any, model: nnx.Module, count: int) -> float:
