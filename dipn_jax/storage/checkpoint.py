@@ -12,6 +12,7 @@ import errno
 import functools
 import hashlib
 import json
+import logging
 import os
 import pathlib
 import shutil
@@ -95,6 +96,9 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
     """
     folder.mkdir(parents=True)
     checkpointer = ocp.StandardCheckpointer()
+    absl = logging.getLogger("absl")
+    level = absl.level
+    absl.setLevel(logging.CRITICAL)  # Orbax logs a traceback of what is said in one line below
     try:
         for name, tree in parts.items():
             checkpointer.save(folder / name, _flat(tree))
@@ -107,6 +111,8 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
             f"{folder.parents[1]}: step {about['step']} cannot be saved ({reason}); earlier steps are whole; make "
             "space and give the same command to go on"
         ) from None
+    finally:
+        absl.setLevel(level)
     for marker in folder.rglob("commit_success.txt"):  # Orbax writes the present folder into it
         marker.write_text("Checkpoint commit was successful\n")
     stored = sorted(p for p in folder.rglob("*") if p.is_file())
