@@ -29,6 +29,8 @@ from dipn_jax.errors import UserError
 if TYPE_CHECKING:
     import rich.progress
 
+STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name))
+"""Signals that ask to stop as SIGINT does: a job manager's, a closed terminal's, a time limit's warning."""
 LOG_PERIOD = 10.0
 """Seconds between progress lines where there is no terminal."""
 
@@ -129,6 +131,11 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
+def warn(text: str) -> None:
+    """One line for the user, on standard error, about what goes on in spite of it."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)
+
+
 def require_positive(**values: float) -> None:
     """Raise a UserError for the first value that is not a finite number above zero."""
     for name, value in values.items():
@@ -161,8 +168,13 @@ def _option(name: str) -> str:
     return f"--{name.rstrip('_').replace('_', '-')}"
 
 
+def _stops() -> list[signal.Signals]:
+    """Return the signals of STOPS that are heeded: all, but none that is ignored because `nohup` asked for it."""
+    return [number for number in STOPS if signal.getsignal(number) != signal.SIG_IGN]
+
+
 class Interruption:
-    """A context in which the first SIGINT or SIGTERM only sets `requested`; a second one acts as usual."""
+    """A context in which the first SIGINT or signal of STOPS only sets `requested`; a second one acts as usual."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -170,7 +182,7 @@ class Interruption:
 
     def __enter__(self) -> Interruption:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, *_stops()):
                 self._old[number] = signal.signal(number, self._request)
         return self
 
@@ -234,7 +246,8 @@ def exit_code(work: Callable[[], int | None]) -> int:
       when interrupted (what was written before stays valid, and the same command continues).
     """
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # a job manager's stop is an interruption
+        for number in _stops():
+            signal.signal(number, signal.default_int_handler)
     try:
         try:
             return work() or 0

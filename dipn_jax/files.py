@@ -10,6 +10,7 @@ import json
 import os
 import pathlib
 import secrets
+import shutil
 from typing import Any
 
 from dipn_jax.errors import UserError
@@ -100,6 +101,28 @@ def write_text(path: pathlib.Path, text: str) -> None:
     Where the locale knows no UTF-8, Python has the bytes of a path's name as surrogates: they become those bytes again.
     """
     write_atomically(path, text.encode("utf-8", "surrogateescape"))
+
+
+def sweep(folder: pathlib.Path) -> None:
+    """Delete the temporary files and folders in `folder` (`.NAME.PID[-...].tmp`) whose process is dead.
+
+    A process of another machine looks dead here: call it only where this process owns the folder.
+    """
+    for path in folder.glob(".*.tmp") if folder.is_dir() else []:
+        number = path.name.split(".")[-2].partition("-")[0]
+        if number.isdecimal() and int(number) != os.getpid() and not alive(int(number)):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def alive(process: int) -> bool:
+    """Return whether there is a process of this number on this machine."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:

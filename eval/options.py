@@ -38,11 +38,16 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, pathlib.Path) else value
 
 
+def recorded(settings: dict[str, Any], partial: resume.Partial) -> dict[str, Any]:
+    """What `settings.json` records: the options, and which step of each network was measured."""
+    return {key: plain(value) for key, value in settings.items()} | {"networks": partial.networks}
+
+
 def finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], partial: resume.Partial) -> None:
     """Write the metrics of an evaluation, delete what it kept in case of an interruption, and print the metrics."""
     from . import metrics
 
-    metrics.write(out, values, settings={key: plain(value) for key, value in settings.items()})
+    metrics.write(out, values, settings=recorded(settings, partial))
     partial.finish()
     for name, value in values.items():
         console.say(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")

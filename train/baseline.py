@@ -23,11 +23,11 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
 
-from . import acting, tables
+from . import acting, finite, tables
 from .acting import Look
 from .configs import BaselineConfig
 from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, view, windows
@@ -42,6 +42,7 @@ RECENT_ACTIONS = 100
 """The number of last actions over which rewards are averaged."""
 
 
+@plain.register
 @dataclasses.dataclass
 class State:
     """Everything that an interrupted run needs to continue."""
@@ -104,7 +105,7 @@ def learn(
       Mean reward of all and of the last pushes and grasps.
 
     Raises:
-      UserError: the folder holds another run, or there is no scorer for `dqn`.
+      UserError: the folder holds another run, there is no scorer for `dqn`, or a loss is not finite.
     """
     if (config.method == "dqn") != (scorer is not None):
         raise UserError(
@@ -112,18 +113,18 @@ def learn(
         )
     network = VpgConfig(config.preset, LEARNT_PARTS[config.method], "chance" if config.method == "rea" else "value")
     model: Any = checkpoint.build("vpg", network, seed=config.seed)
-    run = Run(out, _identity(engine, scenes, config, scored_by))
-    ended = run.ended()
-    if ended:
-        return {name: value for name, value in ended.items() if name.startswith("reward/")}
-    state = _play(run, model, engine, scenes, config, scorer)
-    nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
-    result = _rewards(state.did, len(state.did)) | {
-        f"{k}/recent": v for k, v in _rewards(state.did, RECENT_ACTIONS).items()
-    }
-    extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
-    run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
-    return result
+    with Run(out, _identity(engine, scenes, config, scored_by)) as run:
+        ended = run.ended()
+        if ended:
+            return {name: value for name, value in ended.items() if name.startswith("reward/")}
+        state = _play(run, model, engine, scenes, config, scorer)
+        nnx.update(model, jax.tree.map(jnp.asarray, state.params), jax.tree.map(jnp.asarray, state.rest))
+        result = _rewards(state.did, len(state.did)) | {
+            f"{k}/recent": v for k, v in _rewards(state.did, RECENT_ACTIONS).items()
+        }
+        extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
+        run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
+        return result
 
 
 def _play(
@@ -146,7 +147,8 @@ def _play(
         return ", ".join(f"{name} {value:.2f}" for name, value in _rewards(state.did, RECENT_ACTIONS).items())
 
     total, log = -(-config.actions // config.tables), functools.partial(_log, run.out, config)
-    return run.play(fresh, act, total=total, what=f"act and learn {config.method}", log=log)
+    trees = {"params": weights, "rest": statistics, "moments": jax.eval_shape(optimizer.init, weights)}
+    return run.play(fresh, act, total=total, what=f"act and learn {config.method}", trees=trees, log=log)
 
 
 def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, scored_by: str) -> dict[str, Any]:
@@ -204,9 +206,18 @@ def _update(state: State, step: Callable[..., Any], config: BaselineConfig) -> t
     rng = np.random.default_rng([config.seed, state.round, 1])
     key = jax.random.fold_in(jax.random.key(config.seed + 1), state.round)
     params, rest, moments = jax.tree.map(jnp.array, (state.params, state.rest, state.moments))
-    for k in range(config.updates):
-        batch = {n: structs.take(some, rng.integers(len(some.target), size=config.batch)) for n, some in seen.items()}
-        params, rest, moments, _ = step(params, rest, moments, batch, jax.random.fold_in(key, k))
+    drawn = [
+        {n: rng.integers(len(some.target), size=config.batch) for n, some in seen.items()}
+        for _ in range(config.updates)
+    ]
+    watch = finite.Watch(
+        config.learning_rate, lambda k: np.concatenate(list(drawn[k].values())), f"round {state.round} of learning"
+    )
+    for k, index in enumerate(drawn):
+        batch = {n: structs.take(some, index[n]) for n, some in seen.items()}
+        params, rest, moments, loss = step(params, rest, moments, batch, jax.random.fold_in(key, k))
+        watch.see(k, loss)
+    watch.check(config.updates, (params, rest, moments))
     return jax.device_get((params, rest, moments))
 
 
@@ -225,4 +236,5 @@ def _log(out: pathlib.Path, config: BaselineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of actions after each round, and mean rewards of the last of them."""
     counts = range(config.tables, len(state.did) + 1, config.tables)
     rows = [{"step": n, **_rewards(state.did[:n], RECENT_ACTIONS)} for n in counts]
-    files.write_text(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+    lines = "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows)
+    files.write_text(out / "metrics.jsonl", lines)

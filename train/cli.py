@@ -35,6 +35,13 @@ def _fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Mod
     _say(out, fit(task, config, out, initial=initial), digits=".4g")
 
 
+def _initial(init: pathlib.Path | None, network: str) -> Any:
+    """The network to start from, if one is given."""
+    from dipn_jax.storage import checkpoint
+
+    return checkpoint.load_network(init, network=network) if init else None
+
+
 def _say(out: pathlib.Path, result: dict[str, float], *, digits: str) -> None:
     console.say(f"{out}: " + ", ".join(f"{name} {value:{digits}}" for name, value in result.items()))
 
@@ -42,6 +49,7 @@ def _say(out: pathlib.Path, result: dict[str, float], *, digits: str) -> None:
 def push(
     data: pathlib.Path,
     out: pathlib.Path,
+    init: pathlib.Path | None = None,
     preset: Preset = "compact",
     limit: int | None = None,
     centimetres: tuple[int, ...] = tuple(range(1, 11)),
@@ -61,7 +69,8 @@ def push(
     Args:
       data: folder of push episodes.
       out: run folder; the same command continues where it stopped.
-      preset: architecture.
+      init: run to start from, or builtin; its architecture is used.
+      preset: architecture, without --init.
       limit: learn from this many of the first episodes only; what is held out stays the same.
       centimetres: push distances learnt.
       without: leave out scenes with an object of these classes, to see how well unseen shapes are predicted.
@@ -72,13 +81,18 @@ def push(
 
     from .push import PushTask
 
-    found = masks == "found"
-    network = DipnConfig(preset=preset)
-    _fit(PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found), config, out)
+    found, initial = masks == "found", _initial(init, "dipn")
+    network = initial.config if initial else DipnConfig(preset=preset)
+    task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found)
+    _fit(task, config, out, initial=initial)
 
 
 def grasp_pretrain(
-    data: pathlib.Path, out: pathlib.Path, preset: Preset = "compact", config: TrainConfig = GRASP_PRETRAIN
+    data: pathlib.Path,
+    out: pathlib.Path,
+    init: pathlib.Path | None = None,
+    preset: Preset = "compact",
+    config: TrainConfig = GRASP_PRETRAIN,
 ) -> None:
     """Train GN on images alone: a pixel is positive where the fingers fit around something.
 
@@ -88,14 +102,17 @@ def grasp_pretrain(
     Args:
       data: folder of settled scenes (dipn-datagen images).
       out: run folder; the same command continues where it stopped.
-      preset: architecture.
+      init: run to start from, or builtin; its architecture is used.
+      preset: architecture, without --init.
       config: optimizer and schedule; an example is a view.
     """
     from dipn_jax.networks.grasp import GraspConfig
 
     from .grasp import PretrainTask
 
-    _fit(PretrainTask(data, GraspConfig(preset=preset)), config, out)
+    initial = _initial(init, "grasp")
+    network = initial.config if initial else GraspConfig(preset=preset)
+    _fit(PretrainTask(data, network), config, out, initial=initial)
 
 
 def grasp(
@@ -113,16 +130,15 @@ def grasp(
     Args:
       data: folders of grasp episodes.
       out: run folder; the same command continues where it stopped.
-      init: run to start from (grasp-pretrain's); its architecture is used.
+      init: run to start from (grasp-pretrain's), or builtin; its architecture is used.
       preset: architecture, without --init.
       config: optimizer and schedule; an example is a grasp.
     """
     from dipn_jax.networks.grasp import GraspConfig
-    from dipn_jax.storage import checkpoint
 
     from .grasp import GraspTask
 
-    initial: Any = checkpoint.load_network(init, network="grasp") if init else None
+    initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
     _fit(GraspTask(data, network), config, out, initial=initial)
 
@@ -142,7 +158,7 @@ def grasp_online(
 
     Args:
       out: run folder; the same command continues where it stopped.
-      init: run to start from (grasp-pretrain's); without it the compact network begins with random weights.
+      init: run to start from (grasp-pretrain's), or builtin; without it the compact network has random weights.
       objects: number of objects on a fresh table: 10, or 1:7.
       engine: physics engine.
       threads: that native simulates on; one a core if not given.

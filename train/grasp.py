@@ -16,7 +16,7 @@ from dipn_jax import batching, console, geometry, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks import grasp, losses
 from dipn_jax.sight import fingers, render
-from dipn_jax.storage import records
+from dipn_jax.storage import plain, records
 from dipn_jax.structs import ABSENT, Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import scenes, shapes
@@ -98,6 +98,7 @@ class PretrainTask:
         return losses.score_loss(nnx.merge(graph, state)(images), labels, weight)
 
 
+@plain.register
 @flax.struct.dataclass
 class Window(Pytree):
     """One executed action as an example; the closing axis of a grasp, or a push, lies along the columns."""

@@ -18,8 +18,9 @@ from flax import nnx
 
 from dipn_jax import console, files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, owner
 
+from . import finite
 from .configs import BaselineConfig, OnlineConfig, TrainConfig
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
@@ -111,12 +112,25 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
       The last evaluation.
 
     Raises:
-      UserError: the folder holds a run of another config or on other data.
+      UserError: the folder holds a run of another config or on other data, or another process has it; or a loss or
+        a weight is not finite, after which nothing is saved.
     """
     _check(config, out)
     optimizer = make_optimizer(config)
+    with owner.owned(out):
+        return _fit(task, config, out, optimizer, initial)
+
+
+def _fit(
+    task: Task,
+    config: TrainConfig,
+    out: pathlib.Path,
+    optimizer: optax.GradientTransformation,
+    initial: nnx.Module | None,
+) -> dict[str, float]:
+    """Train in a folder that this process owns; arguments as of `fit`."""
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
-    files.claim(out, _identity(task, config, initial))
+    _claim(out, _identity(task, config, initial), config)
     moments, begin = _resume(out, model, optimizer)
     graph, params, rest = _split(model)
     order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
@@ -124,6 +138,7 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
     log = _Log(out, begin)
     key = jax.random.key(config.seed)
     latest: dict[str, float] = {}
+    watch = finite.Watch(config.learning_rate, lambda k: np.asarray(order[k]), "the last finite checkpoint is kept")
 
     def save(step: int) -> None:
         parts = {"model": nnx.state(nnx.merge(graph, params, rest)), "train": moments}
@@ -142,13 +157,19 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
         while step < config.steps:
             batch = task.fetch(np.asarray(order[step]))
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
+            watch.see(step, loss)
             step += 1
-            if step % config.eval_every == 0 or step == config.steps:
+            evaluating = step % config.eval_every == 0 or step == config.steps
+            saving = step % config.save_every == 0 or step == config.steps or interruption.requested
+            if evaluating or saving:
+                watch.check(step, (params, rest, moments))
+            if evaluating:
                 model = nnx.merge(graph, params, rest)
                 model.eval()
                 latest = {"loss": float(loss), **task.evaluate(model)}
+                watch.check(step, params, **latest)
                 log.write(step, latest)
-            if step % config.save_every == 0 or step == config.steps or interruption.requested:
+            if saving or interruption.requested:
                 save(step)
             if interruption.requested:
                 raise KeyboardInterrupt
@@ -190,6 +211,24 @@ def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> di
     return {**data, **network, **dataclasses.asdict(config)}
 
 
+def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> None:
+    """Claim the folder; a rate that is constant allows more steps.
+
+    Raises:
+      UserError: the folder holds another run, or one whose rate has fallen for another number of steps.
+    """
+    if config.optimizer == "sgd":
+        return files.claim(out, identity, free=("steps",))
+    path = out / "config.json"
+    begun = files.read_json(path).get("steps", config.steps) if path.exists() else config.steps
+    files.claim(out, identity | {"steps": begun})
+    if begun != config.steps:
+        raise UserError(
+            f"{out}: its learning rate falls to 0 at --steps {begun}, so that it cannot go on to {config.steps}; give "
+            f"--init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
+        )
+
+
 def _step_of(line: str) -> float:
     """Return the step of a line of `metrics.jsonl`; infinite if a hard stop cut the line."""
     try:
@@ -210,7 +249,7 @@ class _Log:
 
     def write(self, step: int, values: dict[str, float]) -> None:
         with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps({"step": step, **values}) + "\n")
+            stream.write(json.dumps({"step": step, **values}, allow_nan=False) + "\n")
         for name, value in values.items():
             self.events.add_scalar(name, value, step)
 

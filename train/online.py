@@ -19,12 +19,12 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspNet, score_image
 from dipn_jax.planning import candidates
 from dipn_jax.sight import render
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
 from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
 
-from . import tables
+from . import finite, tables
 from .configs import OnlineConfig
 from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
 from .loop import constant_adamw, make_step
@@ -35,6 +35,7 @@ RECENT_GRASPS = 50
 """The number of last grasps over which success is counted."""
 
 
+@plain.register
 @dataclasses.dataclass
 class State:
     """Everything that an interrupted run needs to continue."""
@@ -63,7 +64,7 @@ def learn(
       Success over all grasps and over the last ones.
 
     Raises:
-      UserError: the network is not compact, or the folder holds another run.
+      UserError: the network is not compact, the folder holds another run, or a loss is not finite.
     """
     if model.config.preset != "compact":
         raise UserError(
@@ -71,19 +72,23 @@ def learn(
             "dipn-train grasp"
         )
     identity = {"initial_weights": checkpoint.digest(model), **dataclasses.asdict(config), "scenes": str(scenes)}
-    run = Run(out, identity | {"engine": type(engine).__name__})
-    ended = run.ended()
-    if ended:
-        return {name: ended[name] for name in ("success", "success_recent")}
-    state = _play(run, model, engine, scenes, config)
-    nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
-    result = {
-        "success": float(np.mean(state.success)),
-        "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
-    }
-    extra = {"seed": config.seed, "examples": len(state.success), **result}
-    run.finish(model, len(state.success), network="grasp", config=model.config, extra=extra)
-    return result
+    with Run(out, identity | {"engine": type(engine).__name__}) as run:
+        ended = run.ended()
+        if ended:
+            return {name: ended[name] for name in ("success", "success_recent")}
+        state = _play(run, model, engine, scenes, config)
+        if not state.success:
+            raise UserError(
+                f"{out}: every simulation failed, so nothing was learnt; give another --engine or --objects"
+            )
+        nnx.update(model, jax.tree.map(jax.numpy.asarray, state.params))
+        result = {
+            "success": float(np.mean(state.success)),
+            "success_recent": float(np.mean(state.success[-RECENT_GRASPS:])),
+        }
+        extra = {"seed": config.seed, "examples": len(state.success), **result}
+        run.finish(model, len(state.success), network="grasp", config=model.config, extra=extra)
+        return result
 
 
 def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config: OnlineConfig) -> State:
@@ -103,8 +108,9 @@ def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config
         state.params, state.moments = _update(state, step, rest, config, jax.random.fold_in(key, state.round))
         return f"{np.mean(state.success[-RECENT_GRASPS:]):.2f} of the last {RECENT_GRASPS} held"
 
-    log = functools.partial(_log, run.out, config)
-    return run.play(fresh, act, total=-(-config.grasps // config.tables), what="grasp and learn", log=log)
+    log, total = functools.partial(_log, run.out, config), -(-config.grasps // config.tables)
+    trees = {"params": weights, "moments": jax.eval_shape(optimizer.init, weights)}
+    return run.play(fresh, act, total=total, what="grasp and learn", trees=trees, log=log)
 
 
 class _Outcomes:
@@ -152,11 +158,14 @@ def _update(state: State, step: Callable[..., Any], rest: Any, config: OnlineCon
     seen = structs.concatenate(state.seen)
     rng = np.random.default_rng([config.seed, state.round])
     params, moments = jax.tree.map(jax.numpy.array, (state.params, state.moments))
-    for k in range(config.updates):
-        batch = structs.take(seen, rng.integers(len(seen.target), size=config.batch))
-        params, rest, moments, _ = step(
-            params, jax.tree.map(jax.numpy.array, rest), moments, batch, jax.random.fold_in(key, k)
+    drawn = [rng.integers(len(seen.target), size=config.batch) for _ in range(config.updates)]
+    watch = finite.Watch(config.learning_rate, drawn.__getitem__, f"round {state.round} of learning")
+    for k, index in enumerate(drawn):
+        params, rest, moments, loss = step(
+            params, jax.tree.map(jax.numpy.array, rest), moments, structs.take(seen, index), jax.random.fold_in(key, k)
         )
+        watch.see(k, loss)
+    watch.check(config.updates, (params, moments))
     return jax.device_get((params, moments))
 
 
@@ -164,4 +173,5 @@ def _log(out: pathlib.Path, config: OnlineConfig, state: State) -> None:
     """Write `metrics.jsonl`: the number of grasps after each round, and success over the last of them."""
     counts = range(config.tables, len(state.success) + 1, config.tables)
     rows = [{"step": n, "success": float(np.mean(state.success[max(0, n - RECENT_GRASPS) : n]))} for n in counts]
-    files.write_text(out / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+    lines = "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows)
+    files.write_text(out / "metrics.jsonl", lines)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import pathlib
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
+import jax
 from flax import nnx
 
 from dipn_jax import console, files
-from dipn_jax.storage import checkpoint, resume
+from dipn_jax.storage import checkpoint, owner, resume
 
 
 class State(Protocol):
-    """State of a run after some rounds; it can be pickled."""
+    """State of a run after some rounds: a dataclass that `plain` has registered."""
 
+    __dataclass_fields__: ClassVar[dict[str, Any]]
     round: int
 
 
@@ -22,21 +26,33 @@ S = TypeVar("S", bound=State)
 
 
 class Run:
-    """The folder of a run."""
+    """The folder of a run; it has to be entered (`with`), by which this process owns it."""
 
     def __init__(self, out: pathlib.Path, identity: dict[str, Any]) -> None:
-        """Claim the folder.
+        """Prepare to claim the folder.
 
         Args:
-          out: folder: `config.json`, `checkpoints/`, and `partial.pickle` until the end.
+          out: folder: `config.json`, `checkpoints/`, and `partial.npz` until the end.
           identity: everything that determines the result of the run.
+        """
+        self.out, self._identity = out, identity
+        self._owned = contextlib.ExitStack()
+        self._partial = resume.Partial(out, identity)
+
+    def __enter__(self) -> Self:
+        """Own and claim the folder.
 
         Raises:
-          UserError: the folder holds another run.
+          UserError: another process has it, or it holds another run.
         """
-        files.claim(out, identity)
-        self.out = out
-        self._partial = resume.Partial(out, identity)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(owner.owned(self.out))
+            files.claim(self.out, self._identity)
+            self._owned = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._owned.close()
 
     def ended(self) -> dict[str, Any] | None:
         """Return what was saved at the end; None if the run has not ended."""
@@ -50,6 +66,7 @@ class Run:
         *,
         total: int,
         what: str,
+        trees: dict[str, Any],
         log: Callable[[S], None] = lambda _: None,
     ) -> S:
         """Act until `total` rounds are done.
@@ -59,16 +76,22 @@ class Run:
           act: does one round in place; returns a note for the progress line.
           total: number of rounds.
           what: title of the progress.
+          trees: fields of the state that hold pytrees of arrays of any structure, such as an optimizer's, by name: a
+            pytree of the same structure.
           log: writes the results of the rounds so far; it depends on the state alone.
         """
         state: S | None = self._partial.load(None)
         if state is None:
             state = fresh()
+        else:
+            for name, like in trees.items():
+                setattr(state, name, jax.tree.unflatten(jax.tree.structure(like), getattr(state, name)))
         with console.Progress(what, total, unit="rounds", done=state.round) as progress:
             while state.round < total:
                 note = act(state)
                 state.round += 1
-                self._partial.save(state)
+                leaves: Any = {name: jax.tree.leaves(getattr(state, name)) for name in trees}
+                self._partial.save(dataclasses.replace(state, **leaves))
                 log(state)
                 progress.advance(1, note)
         log(state)  # again, in case the run was interrupted between saving and logging its last round

@@ -10,6 +10,7 @@ import numpy as np
 
 from dipn_jax import structs
 from dipn_jax.engine import Engine
+from dipn_jax.storage import plain
 from dipn_jax.structs import Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import clutter
@@ -19,6 +20,7 @@ IDLE_LIMIT = 3
 """Actions without effect in a row after which a table is replaced."""
 
 
+@plain.register
 @dataclasses.dataclass
 class Tables:
     """T tables, with everything about them that an interrupted run has to keep."""

@@ -8,8 +8,11 @@ reading goes back to the newest step that is whole.
 from __future__ import annotations
 
 import dataclasses
+import errno
+import functools
 import hashlib
 import json
+import logging
 import os
 import pathlib
 import shutil
@@ -21,10 +24,12 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import files
+from dipn_jax import console, files
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
 
+WANTED = "give a run (the --out of dipn-train), one step of it (RUN@STEP) or that step's folder (RUN/checkpoints/STEP)"
+"""What is accepted where a network is asked for, for messages."""
 FORMAT_VERSION = 1
 """Version of the format; steps of another version are ignored."""
 NETWORKS: dict[str, tuple[type, type]] = {
@@ -41,7 +46,9 @@ def build(name: str, config: Any, *, seed: int = 0) -> nnx.Module:
 
 
 def _steps(run: pathlib.Path) -> list[pathlib.Path]:
-    """Return the step folders of a run, newest first."""
+    """Return the step folders of a run, newest first; of a step's folder, itself."""
+    if run.name.isdigit() and run.resolve().parent.name == "checkpoints":
+        return [run] if run.is_dir() else []
     folder = run / "checkpoints"
     found = [p for p in folder.iterdir() if p.name.isdigit()] if folder.is_dir() else []
     return sorted(found, key=lambda p: int(p.name), reverse=True)
@@ -69,29 +76,61 @@ def save(
     final = run.resolve() / "checkpoints" / f"{step:08d}"
     temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    checkpointer = ocp.StandardCheckpointer()
-    for name, tree in parts.items():
-        checkpointer.save(temporary / name, _flat(tree))
-    checkpointer.wait_until_finished()
-    for marker in temporary.rglob("commit_success.txt"):  # Orbax writes the present folder into it
-        marker.write_bytes(b"Checkpoint commit was successful\n")
-    stored = sorted(p for p in temporary.rglob("*") if p.is_file())
-    meta = {
-        "format_version": FORMAT_VERSION,
-        "network": network,
-        "network_config": dataclasses.asdict(config),
-        "step": step,
-        "versions": files.package_versions(),
-        "sha256": {str(p.relative_to(temporary)): files.file_sha256(p) for p in stored},
-        **extra,
-    }
-    files.write_json(temporary / "meta.json", meta)
-    shutil.rmtree(final, ignore_errors=True)
-    temporary.rename(final)
+    about = {"network": network, "network_config": dataclasses.asdict(config), "step": step}
+    try:
+        _write(temporary, parts, about, extra)
+        shutil.rmtree(final, ignore_errors=True)
+        temporary.rename(final)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
     for old in older[keep - 1 :]:
         shutil.rmtree(old)
+
+
+def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], extra: Any) -> None:
+    """Write the arrays and the metadata of one step into `folder`.
+
+    Raises:
+      UserError: there is no space for it.
+    """
+    folder.mkdir(parents=True)
+    checkpointer = ocp.StandardCheckpointer()
+    absl = logging.getLogger("absl")
+    level = absl.level
+    absl.setLevel(logging.CRITICAL)  # Orbax logs a traceback of what is said in one line below
+    try:
+        for name, tree in parts.items():
+            checkpointer.save(folder / name, _flat(tree))
+        checkpointer.wait_until_finished()
+    except Exception as error:  # TensorStore has errors of its own for what the system says
+        reason = _system_error(error)
+        if reason is None:
+            raise
+        raise UserError(
+            f"{folder.parents[1]}: step {about['step']} cannot be saved ({reason}); earlier steps are whole; make "
+            "space and give the same command to go on"
+        ) from None
+    finally:
+        absl.setLevel(level)
+    for marker in folder.rglob("commit_success.txt"):  # Orbax writes the present folder into it
+        marker.write_text("Checkpoint commit was successful\n")
+    stored = sorted(p for p in folder.rglob("*") if p.is_file())
+    meta = {
+        "format_version": FORMAT_VERSION,
+        **about,
+        "versions": files.package_versions(),
+        "sha256": {str(p.relative_to(folder)): files.file_sha256(p) for p in stored},
+        **extra,
+    }
+    files.write_json(folder / "meta.json", meta)
+
+
+def _system_error(error: Exception) -> str | None:
+    """Return what the system said, where an error says that the disk is full or cannot be written; None if not."""
+    said = f"{error} {error.__cause__ or ''}"
+    numbers = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
+    return next((os.strerror(n) for n in numbers if getattr(error, "errno", None) == n or os.strerror(n) in said), None)
 
 
 def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
@@ -120,12 +159,28 @@ def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
 
 
 def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
-    """Return the newest whole step of a run and its metadata; None if there is none."""
-    for folder in _steps(run):
+    """Return the newest whole step of a run and its metadata, None if there is none; a damaged newer one is named."""
+    steps = _steps(run)
+    for number, folder in enumerate(steps):
         meta = _whole(folder)
         if meta is not None:
+            if number:
+                damaged = ", ".join(str(one) for one in steps[:number])
+                _warn_once(f"{damaged}: damaged; step {meta['step']} of {run} is used instead")
             return folder, meta
     return None
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    """Warn, once a process: a command looks for the newest step several times."""
+    console.warn(text)
+
+
+def used(run: pathlib.Path) -> dict[str, Any] | None:
+    """Return step and digest (SHA-256 of the metadata, which has those of all files) of the step that a run loads."""
+    found = newest(run)
+    return found and {"step": found[1]["step"], "digest": files.file_sha256(found[0] / "meta.json")}
 
 
 def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
@@ -191,7 +246,18 @@ def config_from_json(name: str, values: dict[str, Any]) -> Any:
 
 
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
-    """Return the folder of a run; `builtin` stands for the network that comes with the package, if one does."""
+    """Return the folder of a run, or of one step of it where `RUN@STEP` is given.
+
+    `builtin` stands for the network that comes with the package, if one does.
+    """
+    base, at, step = str(run).rpartition("@")
+    if at and step.isdecimal() and not run.exists():
+        steps = _steps(pathlib.Path(base))
+        for folder in steps:
+            if int(folder.name) == int(step):
+                return folder
+        kept = f"it has {', '.join(str(int(p.name)) for p in steps)}" if steps else "it has none"
+        raise UserError(f"checkpoint {run}: no such step of {base}; {kept}")
     if str(run) != "builtin":
         return files.absolute(run)
     folder = pathlib.Path(__file__).parents[1] / "data" / network
@@ -216,10 +282,10 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     """
     run = find(pathlib.Path(run), network=network)
     if not run.is_dir():
-        raise UserError(f"checkpoint {run}: no such folder; give the --out of a dipn-train run")
+        raise UserError(f"checkpoint {run}: no such folder; {WANTED}")
     found = newest(run)
     if found is None:
-        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; train again or give another run")
+        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; {WANTED}, or train again")
     folder, meta = found
     if meta["network"] != network:
         raise UserError(f"checkpoint {run}: holds a {meta['network']} network, want {network}; give another run")

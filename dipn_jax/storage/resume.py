@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import pathlib
-import pickle
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import files
-from dipn_jax.storage import checkpoint
+from dipn_jax import console, files
+from dipn_jax.storage import checkpoint, plain
+
+FORMAT_VERSION = 1
+"""Version of the format; a state of another version is not taken up."""
 
 
 class Partial:
-    """The state of unfinished work, in `OUT/partial.pickle`; a state of other settings is ignored."""
+    """The state of unfinished work, in `OUT/partial.npz`; one of other settings, inputs or sources is not taken up.
+
+    `networks` holds step and digest of each run among the inputs, by its name.
+    """
 
     def __init__(self, out: pathlib.Path, settings: dict[str, Any], *, inputs: Sequence[pathlib.Path] = ()) -> None:
         """Prepare to load and save the state of work with these settings.
@@ -23,29 +29,44 @@ class Partial:
           settings: options that the results depend on; those that are paths are recorded by `inputs`.
           inputs: files and runs that the results depend on, by content, not by name.
         """
-        self.path = out / "partial.pickle"
+        self.path = out / "partial.npz"
         content = [_fingerprint(path) for path in inputs]
-        self._paths = {key for key, value in settings.items() if _has_path(value)}
-        named = {key: str(value) for key, value in settings.items() if key not in self._paths}
-        self.identity = json.dumps([named, content, files.package_versions()])
+        named = {key: str(value) for key, value in settings.items() if not _has_path(value)}
+        self.identity = json.dumps([FORMAT_VERSION, named, content])
+        self.networks = {str(path): checkpoint.used(path) for path in inputs if not path.is_file()}
+        self.code = files.code_digest(*_stages())
 
     def load(self, fresh: Any) -> Any:
-        """Return the state kept, or `fresh` if there is none for these settings."""
+        """Return the state kept, or `fresh` if there is none for these settings, with a line if it cannot be used."""
         try:
-            identity, state = pickle.loads(self.path.read_bytes())
-            named, *others = json.loads(identity)  # earlier versions wrote the paths, too, as they were given
-            identity = json.dumps([{k: v for k, v in named.items() if k not in self._paths}, *others])
-        except Exception:  # a foreign or damaged pickle can raise anything; then there is no state
+            kept = plain.loads(self.path.read_bytes())
+            identity, code, state = kept["identity"], kept["code"], kept["state"]
+        except FileNotFoundError:
             return fresh
-        return state if identity == self.identity else fresh
+        except Exception:  # a damaged file can raise anything
+            console.warn(f"{self.path}: damaged, or kept by another version; begins anew")
+            return fresh
+        if identity != self.identity:
+            return fresh
+        if code != self.code:
+            console.warn(f"{self.path}: kept by other sources or versions of packages than now; begins anew")
+            return fresh
+        return state
 
     def save(self, state: Any) -> None:
-        """Keep `state` (anything that can be pickled), atomically."""
-        files.write_atomically(self.path, pickle.dumps((self.identity, state)))
+        """Keep `state` (what `plain.dumps` takes), atomically."""
+        files.write_atomically(self.path, plain.dumps({"identity": self.identity, "code": self.code, "state": state}))
 
     def finish(self) -> None:
-        """Delete the state, once the results are written."""
+        """Delete the state, once the results are written; also one that an earlier version kept and nothing reads."""
         self.path.unlink(missing_ok=True)
+        self.path.with_suffix(".pickle").unlink(missing_ok=True)
+
+
+def _stages() -> list[pathlib.Path]:
+    """Return the folders of the stages that keep states."""
+    found = [importlib.util.find_spec(f"dipn_jax.{stage}") for stage in ("train", "eval")]
+    return [pathlib.Path(each.origin).parent for each in found if each and each.origin]
 
 
 def _has_path(value: Any) -> bool:
@@ -57,5 +78,5 @@ def _fingerprint(path: pathlib.Path) -> str:
     """Return the SHA-256 of a file, or of the newest checkpoint of a run."""
     if path.is_file():
         return files.file_sha256(path)
-    found = checkpoint.newest(path)
-    return files.file_sha256(found[0] / "meta.json") if found else "none"
+    found = checkpoint.used(path)
+    return str(found["digest"]) if found else "none"

@@ -173,7 +173,7 @@ def sweep(
     if pushes:
         values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
     sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
-    metrics.write(out, values, settings={key: options.plain(value) for key, value in settings.items()})
+    metrics.write(out, values, settings=options.recorded(settings, kept))
     kept.finish()
     console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
 

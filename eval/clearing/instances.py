@@ -11,6 +11,7 @@ import numpy as np
 from dipn_jax import structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
+from dipn_jax.storage import plain
 from dipn_jax.structs import Fault, Scene
 from dipn_jax.world import cases as case_files
 from dipn_jax.world import clutter, primitives, scenes
@@ -23,6 +24,7 @@ FRICTION_FACTOR = (0.85, 1.15)
 """Range of the factor on its friction."""
 
 
+@plain.register
 @dataclasses.dataclass
 class Instance:
     """One table being cleared."""

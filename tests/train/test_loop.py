@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import pathlib
@@ -8,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from dipn_jax.train import grasp as grasp_task
-from dipn_jax.train import online
+from dipn_jax.train import online, rounds
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
 from dipn_jax.train.push import PushTask
@@ -68,6 +69,64 @@ def test_a_folder_belongs_to_one_run(task: PushTask, tmp_path: pathlib.Path) -> 
     fit(task, BRIEF, tmp_path)
     with pytest.raises(UserError, match="begun with batch=4, asked for batch=2"):
         fit(task, TrainConfig(steps=6, batch=2), tmp_path)
+
+
+def test_a_run_that_is_going_on_is_not_started_again(
+    task: PushTask, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def again(_: np.ndarray) -> Any:
+        return fit(task, BRIEF, tmp_path)
+
+    monkeypatch.setattr(task, "fetch", again)
+    with pytest.raises(UserError, match=f"in use by host .*, pid {os.getpid()}, started"):
+        fit(task, BRIEF, tmp_path)
+    with pytest.raises(UserError, match="in use"), rounds.Run(tmp_path, {}), rounds.Run(tmp_path, {}):
+        pass
+    assert not (tmp_path / "owner.json").exists()
+
+
+def test_more_steps_go_on_where_the_rate_is_constant(task: PushTask, tmp_path: pathlib.Path) -> None:
+    plan = dataclasses.replace(BRIEF, steps=2, optimizer="sgd", eval_every=2)
+    more = dataclasses.replace(plan, steps=4)
+    fit(task, plan, tmp_path / "on")
+    fit(task, more, tmp_path / "on")
+    fit(task, more, tmp_path / "whole")
+    for a, b in zip(_weights(tmp_path / "whole"), _weights(tmp_path / "on"), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def _refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def test_a_loss_that_is_not_finite_ends_a_run_at_the_last_finite_checkpoint(
+    task: PushTask, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetched: list[np.ndarray] = []
+    fetch = task.fetch
+
+    def spoilt(index: np.ndarray) -> Any:
+        fetched.append(index)
+        batch = fetch(index)
+        return batch.replace(target=batch.target * np.float32("nan")) if len(fetched) == 3 else batch
+
+    monkeypatch.setattr(task, "fetch", spoilt)
+    plan = TrainConfig(steps=8, batch=4, eval_every=2, save_every=2)
+    with pytest.raises(UserError, match=r"^step 3: the loss is not finite at --learning-rate 0\.001, ex") as told:
+        fit(task, plan, tmp_path)
+    named = str(told.value).split("examples ")[1].split(";")[0]
+    assert [int(n) for n in named.split()] == fetched[2].tolist()
+    assert checkpoint.newest(tmp_path)[1]["step"] == 2  # type: ignore[index]
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["00000002"]
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line, parse_constant=_refuse)["step"] for line in lines] == [2]
+
+
+def test_weights_that_overflow_are_not_saved(task: PushTask, tmp_path: pathlib.Path) -> None:
+    plan = TrainConfig(steps=1, batch=4, learning_rate=1e39, optimizer="sgd")
+    with pytest.raises(UserError, match="step 1: a weight is not finite"):
+        fit(task, plan, tmp_path)
+    assert checkpoint.newest(tmp_path) is None and not (tmp_path / "metrics.jsonl").read_text()
 
 
 def _loss(task: Any, model: nnx.Module, count: int) -> float:

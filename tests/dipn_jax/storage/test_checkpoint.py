@@ -1,16 +1,19 @@
 import json
 import pathlib
+import resource
+import signal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from dipn_jax.eval import options
 from flax import nnx
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, resume
 
 CONFIG = GraspConfig(width=8)
 BUILTIN = pathlib.Path("builtin")
@@ -142,3 +145,56 @@ def test_another_architecture_is_named(tmp_path: pathlib.Path) -> None:
     path.write_text(json.dumps(meta))
     with pytest.raises(UserError, match="config does not fit"):
         checkpoint.load_network(tmp_path, network="grasp")
+
+
+def test_a_damaged_newest_step_is_named_once_with_the_step_used(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _save(tmp_path, 1)
+    _save(tmp_path, 2, seed=1)
+    newest = tmp_path / "checkpoints" / "00000002"
+    (newest / "meta.json").write_text("{}")
+    checkpoint.load_network(tmp_path, network="grasp")
+    partial = resume.Partial(tmp_path / "out", {}, inputs=[tmp_path])
+    assert capsys.readouterr().err == f"warning: {newest}: damaged; step 1 of {tmp_path} is used instead\n"
+    digest = files.file_sha256(tmp_path / "checkpoints" / "00000001" / "meta.json")
+    options.finish(tmp_path / "out", {"x": 1}, {"seed": 0}, partial)
+    settings = json.loads((tmp_path / "out" / "settings.json").read_text())
+    assert settings["seed"] == 0 and settings["networks"] == {str(tmp_path): {"step": 1, "digest": digest}}
+
+
+def test_one_step_is_taken_by_its_folder_or_by_its_number(tmp_path: pathlib.Path) -> None:
+    first = _save(tmp_path, 1)
+    _save(tmp_path, 2, seed=1)
+    for given in (tmp_path / "checkpoints" / "00000001", f"{tmp_path}@1"):
+        loaded = checkpoint.load_network(given, network="grasp")
+        assert checkpoint.digest(loaded) == checkpoint.digest(first)
+    with pytest.raises(UserError, match=r"@3: no such step of .*; it has 2, 1$"):
+        checkpoint.load_network(f"{tmp_path}@3", network="grasp")
+    with pytest.raises(
+        UserError, match=r"no whole step under checkpoints/; give a run .*RUN@STEP.*RUN/checkpoints/STEP"
+    ):
+        checkpoint.load_network(tmp_path / "checkpoints", network="grasp")
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_litter(tmp_path: pathlib.Path) -> None:
+    _save(tmp_path, 1)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    old = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # no file may grow beyond this: File too large
+        with pytest.raises(UserError, match=r"step 2 cannot be saved \(File too large\)") as told:
+            _save(tmp_path, 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, old)
+    assert "\n" not in str(told.value)
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["00000001"]
+    checkpoint.load_network(tmp_path, network="grasp")
+
+
+@pytest.mark.parametrize("code", ["RESOURCE_EXHAUSTED", "UNKNOWN"])
+def test_what_tensorstore_says_of_a_full_disk_is_understood(code: str) -> None:
+    said = f"{code}: Error writing local file: Failed to write [OS error 28: ENOSPC No space left on device]"
+    assert checkpoint._system_error(ValueError(said)) == "No space left on device"
+    assert checkpoint._system_error(ValueError("another shape")) is None

@@ -1,0 +1,79 @@
+"""A run's folder has one owner at a time, with locks and without."""
+
+import errno
+import fcntl
+import json
+import os
+import pathlib
+import signal
+import socket
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from dipn_jax.errors import UserError
+from dipn_jax.storage import owner
+
+HOLD = """
+import pathlib, sys, time
+from dipn_jax.storage import owner
+with owner.owned(pathlib.Path(sys.argv[1])):
+    print("mine", flush=True)
+    time.sleep(600)
+"""
+
+
+def _no_locks(*_: Any) -> None:
+    raise OSError(errno.ENOLCK, "no locks")
+
+
+def test_the_second_is_told_who_has_it_and_a_dead_owner_does_not_block(tmp_path: pathlib.Path) -> None:
+    other = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout is not None and other.stdout.readline() == "mine\n"
+        who = f"in use by host {socket.gethostname()}, pid {other.pid}, started 2"
+        with pytest.raises(UserError, match=who), owner.owned(tmp_path):
+            pass
+    finally:
+        other.send_signal(signal.SIGKILL)
+        other.wait()
+    assert (tmp_path / "owner.json").exists()
+    with owner.owned(tmp_path):
+        assert json.loads((tmp_path / "owner.json").read_text())["pid"] == os.getpid()
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_locks_the_file_is_made_exclusively_and_that_is_said(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(fcntl, "flock", _no_locks)
+    with owner.owned(tmp_path / "run"):
+        assert "no locks" in capsys.readouterr().err
+        with pytest.raises(UserError, match=f"pid {os.getpid()}"), owner.owned(tmp_path / "run"):
+            pass
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    path = tmp_path / "run" / "owner.exclusive.json"
+    path.write_text(json.dumps({"host": "elsewhere", "pid": ended.pid, "started": "today"}))
+    with pytest.raises(UserError, match="host elsewhere"), owner.owned(tmp_path / "run"):
+        pass
+    path.write_text(json.dumps({"host": socket.gethostname(), "pid": ended.pid, "started": "today"}))
+    with owner.owned(tmp_path / "run"):
+        assert json.loads(path.read_text())["pid"] == os.getpid()
+
+
+def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    steps = tmp_path / "checkpoints"
+    for number in (ended.pid, os.getppid()):
+        (steps / f".00000003.{number}.tmp" / "model").mkdir(parents=True)
+        (tmp_path / f".partial.npz.{number}-0a1b2c3d.tmp").touch()
+    (tmp_path / ".mine.tmp").touch()
+    with owner.owned(tmp_path):
+        pass
+    left = {p.name for p in (*tmp_path.iterdir(), *steps.iterdir())}
+    alive = os.getppid()
+    assert left == {"checkpoints", ".mine.tmp", f".00000003.{alive}.tmp", f".partial.npz.{alive}-0a1b2c3d.tmp"}

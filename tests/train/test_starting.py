@@ -1,0 +1,37 @@
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from dipn_jax.train import cli, online
+from dipn_jax.train.loop import TrainConfig
+from flax import nnx
+
+from dipn_jax.errors import UserError
+from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.storage import checkpoint
+from dipn_jax.world import scenes
+
+
+def test_the_refusal_of_more_steps_says_how_and_a_run_starts_from_another(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path
+) -> None:
+    brief = TrainConfig(steps=1, batch=2)
+    cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=brief)
+    begun = checkpoint.load_network("builtin", network="dipn")
+    tuned = checkpoint.load_network(tmp_path / "a", network="dipn")
+    assert tuned.config == begun.config
+    for a, b in zip(*(jax.tree.leaves(nnx.state(one, nnx.Param)) for one in (begun, tuned)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)  # the rate of the first step is 0
+    with pytest.raises(UserError, match=f"falls to 0 at --steps 1, .* --init {tmp_path / 'a'} and another --out"):
+        cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=TrainConfig(steps=2, batch=2))
+
+
+@pytest.mark.slow
+def test_learning_online_stops_at_a_loss_that_is_not_finite(engine: Any, tmp_path: pathlib.Path) -> None:
+    plan = online.OnlineConfig(grasps=6, tables=2, updates=2, batch=4, learning_rate=1e39)
+    network = GraspConfig(width=8, coarse=8, blocks=1)
+    with pytest.raises(UserError, match="not finite"):
+        online.learn(checkpoint.build("grasp", network), engine, scenes.fixed_count(3, spread=0.2), plan, tmp_path)
+    assert not (tmp_path / "checkpoints").exists()
