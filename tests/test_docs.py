@@ -189,7 +189,7 @@ def test_the_commands_of_the_tutorial_work_at_small_scale(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(moving_picture, "PERIOD", 0.5)
-    monkeypatch.setattr(moving_picture, "HOLD", 2)
+    monkeypatch.setattr(moving_picture, "HOLD_FRAMES", 2)
     for words in commands(ROOT / "docs" / "tutorial.md"):
         if words[0] == "python":
             moving_picture.main(pathlib.Path("results/picture"), pathlib.Path("results/clearing.gif"))

@@ -27,7 +27,7 @@ def test_runs_are_distinguished_by_pushes_and_seed(tmp_path: pathlib.Path) -> No
     assert list(curves.load_push_runs(runs)) == ["100/1", "1500/1"]
     with pytest.raises(UserError, match="a second run of 100 pushes with seed 1"):
         curves.load_push_runs([*runs, runs[1]])
-    with pytest.raises(UserError, match="does not say how many pushes"):
+    with pytest.raises(UserError, match="does not name its number of pushes"):
         curves.load_push_runs([_push_run(tmp_path / "old", {})])
 
 
