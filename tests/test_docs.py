@@ -26,15 +26,25 @@ SHELL = re.compile(r"^```bash\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 SMALL = {
     "--episodes": "24", "--steps": "2", "--objects": "1:3", "--candidates": "4", "--distances": "0.05:0.1:0.05",
-    "--scenes": "2", "--instances": "1",
+    "--scenes": "2", "--instances": "1", "--limit": "12",
 }  # fmt: skip
 """Options that make a command of the tutorial large, and the smaller ones of the test."""
 ALWAYS = {
-    "dipn-datagen": ["--objects", "1:3", "--shard-size", "24"],
+    "dipn-datagen": ["--objects", "1:3", "--shard-size", "24", "--episodes", "24"],
     "dipn-train": ["--steps", "2", "--batch", "4", "--eval-every", "2", "--save-every", "2"],
     "dipn-eval": [],
 }
-"""Options that the test adds to commands of the tutorial that make data or train."""
+"""Options that a test adds to those commands where they make or learn something."""
+MAINTENANCE = ("info", "verify", "repair", "export")
+"""Commands that make and learn nothing, and take none of those options."""
+RUN = {
+    "many_workers.md": ("push", *MAINTENANCE),
+    "your_network.md": ("push", "images", "export"),
+    "sweep_distance.md": ("push",),
+    "your_cases.md": ("push", "grasp"),
+    "engines.md": ("push",),
+}
+"""Page of how-tos -> its commands that a test runs; those of the others, and all else there, are only parsed."""
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -171,10 +181,14 @@ def test_the_tutorial_clears_its_table(tmp_path: pathlib.Path) -> None:
 
 
 def smaller(words: list[str]) -> tuple[str, ...]:
-    """Return a command of the tutorial with smaller numbers."""
+    """A command of the tutorial or a how-to, made small."""
     program, name, *rest = words
-    options = [SMALL.get(before, word) for before, word in zip(["", *rest], rest, strict=False)]
+    options = [
+        word if before == "--distances" and ":" not in word else SMALL.get(before, word)
+        for before, word in zip(["", *rest], rest, strict=False)
+    ]
     extra = ALWAYS[program] if name != "images" else ["--shard-size", "24"]
+    extra = [] if name in MAINTENANCE else extra
     given = set(options)
     for option, value in zip(extra[::2], extra[1::2], strict=True):
         options += [] if option in given else [option, value]
@@ -200,3 +214,25 @@ def test_the_commands_of_the_tutorial_work_at_small_scale(
     report = pathlib.Path("results/report/report.html")
     assert report.exists() and pathlib.Path("results/clearing.gif").stat().st_size < 1.5e6
     assert files.read_json(pathlib.Path("results/hard/metrics.json"))["instances"] == 1
+
+
+@pytest.mark.slow
+def test_commands_of_howtos_work_at_small_scale(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the commands in `RUN`, in one folder.
+
+    All other commands of how-tos are parsed by `test_commands_are_ones_that_exist`: they clear tables, measure, learn
+    grasps or need another engine, which takes minutes even when it is made small, or the tutorial runs the same.
+    """
+    monkeypatch.chdir(tmp_path)
+    for name, wanted in RUN.items():
+        done = set()
+        for words in commands(ROOT / "docs" / "howto" / name):
+            if words[1] not in wanted or {"paper", "found", "mjx"} & set(words):
+                continue
+            program, *arguments = smaller(words)
+            known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
+            assert console.run(program, known, arguments) == 0, words
+            done.add(words[1])
+        assert done == set(wanted) & {words[1] for words in commands(ROOT / "docs" / "howto" / name)}, name
+    assert files.read_json(pathlib.Path("data/sweep/config.json"))["distances"] == [0.03, 0.06, 0.1]
+    assert any(pathlib.Path("exported/dipn").iterdir())

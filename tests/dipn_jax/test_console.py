@@ -1,7 +1,6 @@
 """What the commands share: paths as users give them."""
 
 import pathlib
-import pickle
 from typing import Any
 
 import pytest
@@ -97,5 +96,3 @@ def test_work_begun_with_paths_as_they_were_given_goes_on(tmp_path: pathlib.Path
     assert resume.Partial(tmp_path, now | {"seed": 4}).load(None) is None
     resume.Partial(tmp_path, now).save("more")
     assert resume.Partial(tmp_path, now | {"out": tmp_path / "moved"}).load(None) == "more"
-    (tmp_path / "partial.pickle").write_bytes(pickle.dumps(("not JSON", "x")))
-    assert resume.Partial(tmp_path, now).load(None) is None
