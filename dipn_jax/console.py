@@ -25,12 +25,11 @@ import tyro
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.interruption import stops
 
 if TYPE_CHECKING:
     import rich.progress
 
-STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name))
-"""Signals that ask to stop as SIGINT does: a job manager's, a closed terminal's, a time limit's warning."""
 LOG_PERIOD = 10.0
 """Seconds between progress lines where there is no terminal."""
 
@@ -168,33 +167,6 @@ def _option(name: str) -> str:
     return f"--{name.rstrip('_').replace('_', '-')}"
 
 
-def _stops() -> list[signal.Signals]:
-    """Return the signals of STOPS that are heeded: all, but none that is ignored because `nohup` asked for it."""
-    return [number for number in STOPS if signal.getsignal(number) != signal.SIG_IGN]
-
-
-class Interruption:
-    """A context in which the first SIGINT or signal of STOPS only sets `requested`; a second one acts as usual."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._old: dict[int, Any] = {}
-
-    def __enter__(self) -> Interruption:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, *_stops()):
-                self._old[number] = signal.signal(number, self._request)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def _request(self, *_: object) -> None:
-        self.requested = True
-        self.__exit__()
-
-
 def _with_paths(command: Callable[..., Any]) -> Callable[..., Any]:
     """Return `command` with the paths among its arguments made absolute before it begins."""
 
@@ -246,7 +218,7 @@ def exit_code(work: Callable[[], int | None]) -> int:
       when interrupted (what was written before stays valid, and the same command continues).
     """
     if threading.current_thread() is threading.main_thread():
-        for number in _stops():
+        for number in stops():
             signal.signal(number, signal.default_int_handler)
     try:
         try:

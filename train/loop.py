@@ -18,6 +18,7 @@ from flax import nnx
 
 from dipn_jax import console, files
 from dipn_jax.errors import UserError
+from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner
 
 from . import finite
@@ -153,7 +154,7 @@ def _fit(
 
     step = begin
     progress = console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin)
-    with progress, console.Interruption() as interruption:
+    with progress, Interruption() as interruption:
         while step < config.steps:
             batch = task.fetch(np.asarray(order[step]))
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))

@@ -114,7 +114,7 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
     finally:
         absl.setLevel(level)
     for marker in folder.rglob("commit_success.txt"):  # Orbax writes the present folder into it
-        marker.write_text("Checkpoint commit was successful\n")
+        marker.write_bytes(b"Checkpoint commit was successful\n")
     stored = sorted(p for p in folder.rglob("*") if p.is_file())
     meta = {
         "format_version": FORMAT_VERSION,

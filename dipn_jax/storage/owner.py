@@ -75,7 +75,7 @@ def _exclusive(path: pathlib.Path) -> tuple[int, pathlib.Path]:
 def _read(path: pathlib.Path) -> dict[str, object]:
     """Return what stands in the file; nothing if it is damaged or gone."""
     try:
-        found = json.loads(path.read_text())
+        found = json.loads(files.read_text(path))
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

@@ -87,9 +87,9 @@ def test_a_case_file_is_found_below_home(home: pathlib.Path) -> None:
         files.read_json(files.absolute("~/gone"))
 
 
-def test_work_begun_with_paths_as_they_were_given_goes_on(tmp_path: pathlib.Path) -> None:
-    """Paths were a part of what unfinished work is known by, as they were typed; now what they lead to is."""
-    before = {"out": "results/hard", "grasp_net": "runs/gn", "seed": 3, "tables.cases": "mine.json"}
+def test_unfinished_work_continues_when_its_folders_have_moved(tmp_path: pathlib.Path) -> None:
+    """Unfinished work is known by what its paths lead to, not by their names."""
+    before = {name: pathlib.Path(name) for name in ("out", "grasp_net", "tables.cases")} | {"seed": 3}
     now = {"out": tmp_path, "grasp_net": tmp_path / "gn", "seed": 3, "tables.cases": tmp_path / "mine.json"}
     resume.Partial(tmp_path, before).save("half")
     assert resume.Partial(tmp_path, now).load(None) == "half"

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from dipn_jax import console
+from dipn_jax.interruption import Interruption
 
 ALL = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1]
 
@@ -25,7 +26,7 @@ def test_a_signal_lets_the_step_at_hand_end_and_a_command_ends_as_interrupted(nu
     done = []
 
     def work() -> None:
-        with console.Interruption() as interruption:
+        with Interruption() as interruption:
             os.kill(os.getpid(), number)
             done.append("step")
             assert interruption.requested
@@ -40,7 +41,7 @@ def test_a_hang_up_that_nohup_ignores_stays_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
     def work() -> None:
-        with console.Interruption() as interruption:
+        with Interruption() as interruption:
             os.kill(os.getpid(), signal.SIGHUP)
             assert not interruption.requested
         os.kill(os.getpid(), signal.SIGHUP)
