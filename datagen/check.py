@@ -26,7 +26,7 @@ CAMERA_SCENES = 50
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class CheckConfig:
     """Amount of what is measured."""
 
     engines: tuple[str, ...]
@@ -44,21 +44,21 @@ class Plan:
         console.require_seed(self.seed)
 
 
-def run(out: pathlib.Path, plan: Plan, *, threads: int | None = None) -> None:
-    """Measure, and write `metrics.json` and `world.md`; sections already measured with this plan are not repeated.
+def run(out: pathlib.Path, config: CheckConfig, *, threads: int | None = None) -> None:
+    """Measure, and write `metrics.json` and `world.md`; sections already measured with this config are not repeated.
 
     Raises:
-      UserError: an engine cannot run here, or the folder belongs to another plan.
+      UserError: an engine cannot run here, or the folder belongs to another config.
     """
     console.require_out(out)
     engines = {}
-    for name in plan.engines:
+    for name in config.engines:
         variant = world.ENGINES[name]
         engines[name] = make_engine(variant.engine, timestep=variant.timestep, sleep=variant.sleep, threads=threads)
     code = {"versions": files.package_versions(), "code": files.code_digest(pathlib.Path(__file__).parent)}
-    settings = json.loads(json.dumps(dataclasses.asdict(plan))) | code
+    settings = json.loads(json.dumps(dataclasses.asdict(config))) | code
     files.claim(out, settings, free=("engines",))
-    sections = _sections(plan, engines, threads)
+    sections = _sections(config, engines, threads)
     metrics: dict[str, float | None] = {}
     with console.Progress("check-world", len(sections), unit="sections") as progress:
         for name, measure in sections.items():
@@ -74,24 +74,26 @@ def run(out: pathlib.Path, plan: Plan, *, threads: int | None = None) -> None:
     console.say(page(metrics))
 
 
-def _sections(plan: Plan, engines: dict[str, Engine], threads: int | None) -> dict[str, Callable[[], dict[str, float]]]:
+def _sections(
+    config: CheckConfig, engines: dict[str, Engine], threads: int | None
+) -> dict[str, Callable[[], dict[str, float]]]:
     """Return the functions that measure each section, by name."""
     native = make_engine("native", threads=threads)
-    keys = jax.random.split(jax.random.key(plan.seed), 3)
+    keys = jax.random.split(jax.random.key(config.seed), 3)
 
     @functools.cache
     def reference() -> tuple[world.Trial, dict[str, float], np.ndarray, np.ndarray]:
-        made = world.trial(keys[1], native, plan.scenes)
+        made = world.trial(keys[1], native, config.scenes)
         found, poses = world.pushes(native, made)
         return made, found, poses, world.held_by(native, made)
 
     def agree(name: str, engine: Engine) -> dict[str, float]:
         made, _, poses, held = reference()
-        count = min(plan.few, plan.scenes) if name == "warp" else plan.scenes
+        count = min(config.few, config.scenes) if name == "warp" else config.scenes
         return world.agreement(name, engine, made.first(count), poses[:count], held[:count])
 
     def crowds(name: str, engine: Engine) -> dict[str, float]:
-        return world.drops(keys[0], engine, plan.few, name=f"drop-{name}", counts=world.CROWDED_COUNTS)
+        return world.drops(keys[0], engine, config.few, name=f"drop-{name}", counts=world.CROWDED_COUNTS)
 
     def may_crowd(engine: Engine) -> bool:
         """Return whether an engine is fast enough here; MuJoCo Warp would take hours on a CPU."""
@@ -100,12 +102,12 @@ def _sections(plan: Plan, engines: dict[str, Engine], threads: int | None) -> di
     return {
         "drops": lambda: world.drops(keys[0], native, batching.BATCH),
         **{f"drops-{name}": lambda name=name, e=e: crowds(name, e) for name, e in engines.items() if may_crowd(e)},  # type: ignore[misc]
-        "grasps": lambda: world.isolated_grasps(native, plan.seed, plan.tries),
+        "grasps": lambda: world.isolated_grasps(native, config.seed, config.tries),
         "pushes": lambda: reference()[1],
         "sweep": lambda: world.sweep(native, reference()[0], reference()[2]),
         "camera": lambda: world.camera(keys[2], native, CAMERA_SCENES),
         **{
-            f"rest-{name}": lambda name=name, e=e: world.rests(name, e, plan.seed)  # type: ignore[misc]
+            f"rest-{name}": lambda name=name, e=e: world.rests(name, e, config.seed)  # type: ignore[misc]
             for name, e in {"native": native, **engines}.items()
         },
         **{f"agreement-{name}": lambda name=name, e=e: agree(name, e) for name, e in engines.items()},  # type: ignore[misc]

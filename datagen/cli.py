@@ -233,7 +233,7 @@ def check_world(
     """
     from . import check
 
-    check.run(out, check.Plan(engines, scenes=scenes_, few=few, tries=tries, seed=seed), threads=threads)
+    check.run(out, check.CheckConfig(engines, scenes=scenes_, few=few, tries=tries, seed=seed), threads=threads)
 
 
 def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:

@@ -11,7 +11,7 @@ Preset = Literal["compact", "paper"]
 """Architecture of a network: ours, or as published."""
 ShapeClass = Literal["cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave"]
 """A class of shapes, as in `shapes.CLASSES`."""
-MethodName = Literal["vpg", "rea", "dqn"]
+LearnerName = Literal["vpg", "rea", "dqn"]
 """A compared method that learns while it acts."""
 
 
@@ -63,7 +63,7 @@ class OnlineConfig:
 class BaselineConfig:
     """How a compared method learns while it acts."""
 
-    method: MethodName = "vpg"
+    method: LearnerName = "vpg"
     """vpg, rea or dqn."""
     preset: Preset = "compact"
     """Architecture; paper has two DenseNet-121 trunks for each primitive, for an accelerator."""

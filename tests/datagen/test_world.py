@@ -62,17 +62,17 @@ def test_every_item_stays_on_every_face_that_it_can_stand_on(engine: Any) -> Non
 
 def test_an_unknown_engine_is_named() -> None:
     with pytest.raises(UserError, match="bullet: want some of native_awake"):
-        check.Plan(("bullet",), 8, 4, 10, 0)
+        check.CheckConfig(("bullet",), 8, 4, 10, 0)
 
 
 def test_a_folder_that_other_sources_began_is_refused(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = check.Plan((), 8, 4, 10, 0)
+    config = check.CheckConfig((), 8, 4, 10, 0)
     monkeypatch.setattr(check, "_sections", lambda *_: {})
-    check.run(tmp_path, plan)
-    check.run(tmp_path, plan)
+    check.run(tmp_path, config)
+    check.run(tmp_path, config)
     monkeypatch.setattr(files, "code_digest", lambda *_: "other")
     with pytest.raises(UserError, match="begun with code="):
-        check.run(tmp_path, plan)
+        check.run(tmp_path, config)
 
 
 def test_the_page_in_docs_shows_the_figures_in_docs() -> None:
