@@ -16,11 +16,12 @@ LOWEST, HIGHEST = -0.05, 1.0
 
 
 def check_observation(observation: Any) -> None:
-    """Refuse an observation that no network can judge, with one line that says why.
-
-        dipn_jax.check_observation(dipn_jax.Observation(height, color, label, slots=10))
+    """Raise an error with one line for an observation that no network can judge.
 
     A policy of `dipn_jax.load_policy` does this by itself; `dipn_jax.decide` and `dipn_jax.imagine` do not.
+
+    Example:
+      dipn_jax.check_observation(dipn_jax.Observation(height, color, label, slots=10))
 
     Args:
       observation: a `dipn_jax.Observation` of one table.
