@@ -11,6 +11,7 @@ import os
 import pathlib
 import secrets
 import shutil
+import time
 from typing import Any
 
 from dipn_jax.errors import UserError
@@ -169,3 +170,12 @@ def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] 
                 "same options and data to continue"
             )
     write_json(path, mine)
+
+
+def remove_folder(folder: pathlib.Path) -> None:
+    """Delete a folder into which threads of a save that failed may still be writing for a moment."""
+    for pause in (0.0, 0.1, 0.3, 1.0, 2.0):
+        time.sleep(pause)
+        shutil.rmtree(folder, ignore_errors=True)
+        if not folder.exists():
+            return

@@ -82,7 +82,7 @@ def save(
         shutil.rmtree(final, ignore_errors=True)
         temporary.rename(final)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        files.remove_folder(temporary)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
     for old in older[keep - 1 :]:
         shutil.rmtree(old)
