@@ -3,6 +3,7 @@
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
 # make push-figures, make grasp-figures, make clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
 PYTHON ?= python3
+JOBS ?= 2
 BIN := .venv/bin
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
@@ -16,7 +17,7 @@ setup: .venv/.installed
 	touch $@
 
 test: setup lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .
