@@ -56,7 +56,7 @@ def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> Observ
 
 def _decider(preset: str, count: int, *, fast: bool) -> Callable[[Observation, int], Decision]:
     dipn, gn = _networks(preset)
-    predictor, scorer = predictors.dipn_predictor(dipn), scorers.cautious_scorer(gn)
+    predictor, scorer = predictors.dipn_predictor(dipn), scorers.aided_scorer(gn)
     summarize = scorers.grasp_summary(gn) if fast else planner.summarize_whole(scorers.plain_scorer(gn))
 
     def decide(seen: Observation, key: int) -> Decision:
@@ -83,12 +83,20 @@ def speed(setting: Setting) -> Iterator[tuple[str, float]]:
     each = _paper_one_by_one(tables[0], few)
     whole = _paper_whole(tables[0], few)
     for count in COUNTS:
-        yield f"decide.speed/paper_{count}", whole * (1 + count)
+        decide = _decider("compact", count, fast=True)
+        yield f"decide.speed/paper_{count}", whole * _images(decide, tables)
     decide = _decider("compact", 64, fast=True)
-    decide(tables[0], 0)
+    images = _images(decide, tables)
     ours = seconds(lambda: _all(decide, tables)) / len(tables)
-    yield "decide.speed/paper_one_by_one_64", each * 65
-    yield "decide.speed", each * 65 / ours
+    yield "decide.speed/images_64", images
+    yield "decide.speed/paper_one_by_one_64", each * images
+    yield "decide.speed", each * images / ours
+
+
+def _images(decide: Callable[[Observation, int], Decision], tables: list[Observation]) -> float:
+    """Return how many images a decision compares: the present one, and one for each push that is not dropped."""
+    found = [decide(table, 0).candidates for table in tables]
+    return float(np.mean([1 + each.feasible.sum() for each in found if each is not None]))
 
 
 def _all(decide: Callable[[Observation, int], Decision], tables: list[Observation]) -> None:

@@ -166,7 +166,7 @@ def _generate_guided(
         raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
     network: Any = checkpoint.load_network(grasp_net, network="grasp")
     job = dataclasses.replace(job, guided=guided, hard=hard, weights=checkpoint.digest(network))
-    _generate(job, out, work, scorer=scorers.cautious_scorer(network))
+    _generate(job, out, work, scorer=scorers.aided_scorer(network))
 
 
 def images(

@@ -1,10 +1,25 @@
-"""Names of engines and methods, options of the commands. Importing this imports no JAX, so `--help` answers at once."""
+"""Names of engines, methods and aids, options of the commands.
+
+Importing this imports no JAX, so `--help` answers at once.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 EngineName = Literal["auto", "native", "mjx", "warp"]
 """A physics engine; `auto` chooses the faster one here."""
 MethodName = Literal["dipn+gn", "rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"]
 """A method that clears tables, named after the networks (or the physics engine) that it decides with."""
+Aid = Literal["mirrors", "fingers", "border", "table", "still", "memory"]
+"""What helps a method to decide and no paper has:
+
+mirrors: a grasp is chosen by the lowest of its score and the scores of its mirror images.
+fingers: the score of a grasp is halved where a finger would land on something.
+border: something that reaches the border of the image is taken to extend beyond, where a finger could land on it.
+table: a grasp centred on empty table scores 0.
+still: predicted motions of less than half a pixel are not drawn.
+memory: the scores of grasps like one that missed are halved until something near them moves.
+"""
+ALL_AIDS: tuple[Aid, ...] = get_args(Aid)
+"""All aids, which a method has unless told otherwise."""

@@ -7,6 +7,7 @@ import sys
 from dipn_jax import console
 
 from .clearing import command as clearing
+from .clearing import sweep_command as sweeping
 from .grasping import command as grasping
 from .prediction import command as prediction
 from .report import command as report
@@ -15,7 +16,7 @@ COMMANDS = {
     "prediction": prediction.predict,
     "grasp": grasping.grasp,
     "clear": clearing.clear,
-    "sweep": clearing.sweep,
+    "sweep": sweeping.sweep,
     "report": report.report,
 }
 """The commands of `dipn-eval`, by name."""

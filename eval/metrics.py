@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,17 @@ RESAMPLES = 2000
 """Number of bootstrap resamples."""
 
 
-def ratio_interval(hits: np.ndarray, trials: np.ndarray, *, seed: int = 0) -> tuple[float, float, float]:
-    """Return sum(hits) / sum(trials) over instances, with a bootstrap 95 % interval over instances.
+def ratio_interval(
+    hits: np.ndarray, trials: np.ndarray, *, groups: Sequence[Any] | None = None, seed: int = 0
+) -> tuple[float, float, float]:
+    """Return sum(hits) / sum(trials) over tables, with a bootstrap 95 % interval.
 
     Args:
-      hits: `[I]` per instance.
-      trials: `[I]` per instance.
+      hits: `[I]` per table.
+      trials: `[I]` per table.
+      groups: `[I]` what each table is a repeat of, such as its case: groups are drawn with replacement, and then the
+        tables of each (a two-stage bootstrap: Davison and Hinkley, Bootstrap Methods, 1997, 3.8). None: every table is
+        a group of its own.
       seed: random seed of the resampling.
 
     Returns:
@@ -27,11 +33,55 @@ def ratio_interval(hits: np.ndarray, trials: np.ndarray, *, seed: int = 0) -> tu
     hits, trials = np.asarray(hits, float), np.asarray(trials, float)
     if trials.sum() == 0:
         return float("nan"), float("nan"), float("nan")
-    pick = np.random.default_rng(seed).integers(0, len(hits), (RESAMPLES, len(hits)))
-    total = trials[pick].sum(-1)
-    values = hits[pick].sum(-1)[total > 0] / total[total > 0]
+    pick = _resamples(len(hits), groups, seed)
+    total = _total(trials, pick)
+    values = _total(hits, pick)[total > 0] / total[total > 0]
     low, high = np.quantile(values, [0.025, 0.975])
     return float(hits.sum() / trials.sum()), float(low), float(high)
+
+
+def ratio_difference(
+    ours: tuple[np.ndarray, np.ndarray], theirs: tuple[np.ndarray, np.ndarray], groups: Sequence[Any], *, seed: int = 0
+) -> tuple[float, float, float]:
+    """Return how much larger our ratio is than theirs on the same tables, with a paired bootstrap 95 % interval.
+
+    Args:
+      ours: hits and trials, `[I]` each.
+      theirs: hits and trials of the other method on the same tables, in the same order.
+      groups: `[I]` as of `ratio_interval`.
+      seed: random seed of the resampling.
+
+    Returns:
+      Difference, low, high; NaN where one of the two has no trial.
+    """
+    (hits, trials), (others, tried) = (tuple(np.asarray(part, float) for part in side) for side in (ours, theirs))
+    if trials.sum() == 0 or tried.sum() == 0:
+        return float("nan"), float("nan"), float("nan")
+    pick = _resamples(len(hits), groups, seed)
+    both = (_total(trials, pick) > 0) & (_total(tried, pick) > 0)
+    values = (_total(hits, pick)[both] / _total(trials, pick)[both]) - (
+        _total(others, pick)[both] / _total(tried, pick)[both]
+    )
+    low, high = np.quantile(values, [0.025, 0.975])
+    return float(hits.sum() / trials.sum() - others.sum() / tried.sum()), float(low), float(high)
+
+
+def _resamples(count: int, groups: Sequence[Any] | None, seed: int) -> np.ndarray:
+    """Return the tables of each resample `[RESAMPLES, K]`; -1 fills up the rows of small groups."""
+    rng = np.random.default_rng(seed)
+    names = np.arange(count) if groups is None else np.unique(np.asarray(groups), return_inverse=True)[1]
+    members = [np.flatnonzero(names == name) for name in range(names.max() + 1)]
+    sizes = np.array([len(rows) for rows in members])
+    table = np.stack([np.resize(rows, sizes.max()) for rows in members])
+    chosen = rng.integers(0, len(members), (RESAMPLES, len(members)))
+    within = (rng.uniform(size=(RESAMPLES, len(members), sizes.max())) * sizes[chosen][..., None]).astype(int)
+    pick = table[chosen[..., None], within]
+    return np.where(np.arange(sizes.max()) < sizes[chosen][..., None], pick, -1).reshape(RESAMPLES, -1)
+
+
+def _total(values: np.ndarray, pick: np.ndarray) -> np.ndarray:
+    """Return the sum of `values` of each resample."""
+    return np.append(values, 0.0)[pick].sum(-1)
 
 
 def write(out: pathlib.Path, values: dict[str, Any], *, settings: dict[str, Any]) -> None:

@@ -39,8 +39,12 @@ def plain(value: Any) -> Any:
 
 
 def recorded(settings: dict[str, Any], partial: resume.Partial) -> dict[str, Any]:
-    """What `settings.json` records: the options, and which step of each network was measured."""
-    return {key: plain(value) for key, value in settings.items()} | {"networks": partial.networks}
+    """What `settings.json` records: the options, which step of each network was measured, and by which sources."""
+    return {key: plain(value) for key, value in settings.items()} | {
+        "networks": partial.networks,
+        "files": partial.files,
+        "code": partial.code,
+    }
 
 
 def finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], partial: resume.Partial) -> None:

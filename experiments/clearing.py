@@ -1,9 +1,10 @@
-"""Clearing: every method with the paper's samples and with more, and all other results on docs/clearing.md.
+"""Clearing: every method with the same chances, and all other results on docs/clearing.md.
 
     python -m experiments.clearing          # or make clear-figures
+    python -m experiments.clearing --page   # the page from what is kept, complete or not
 
-Hours on 2 cores, and before them the pushes of `experiments.push_prediction` and the pre-trained network of
-`experiments.grasping`, if they are not there yet. It can be interrupted; the same command continues.
+A day or two on 2 cores. It can be interrupted; the same command continues, on another machine too: results are kept
+table by table in docs/clearing-tables.json, and trainings that only they need are not repeated.
 """
 
 from __future__ import annotations
@@ -12,158 +13,161 @@ import pathlib
 import shutil
 import sys
 from collections.abc import Sequence
-from typing import Any
-
-from dipn_jax.eval.clearing import sweeping
-from dipn_jax.eval.report import comparison, paper
 
 from dipn_jax import files
-from experiments import command, grasping, pages, push_prediction
+from experiments import clearing_tables, command, grasping, pages
+from experiments.kept import Kept
 from experiments.runs import Part, Recipe, Run
 
-HARD = "--cases hard --instances 30"
-"""Options for the ten hard cases, 30 times each."""
+KEPT = pages.DOCS / "clearing-tables.json"
+"""File of the results, table by table."""
 
 TABLES = {
-    "hard": HARD,
-    "30": "--cases random --objects 30 --instances 30",
-    "10": "--cases random --objects 10 --instances 30",
+    "hard": "--cases hard --instances 10",
+    "heldout": "--cases heldout --instances 5",
+    "random-10": "--cases random --objects 10 --instances 30",
+    "random-30": "--cases random --objects 30 --instances 20",
 }
-"""Tables of the methods with the paper's samples, by the end of a run's name."""
+"""Options for the tables that every method clears."""
 
-FEWER_TABLES = {"hard": HARD, "30": "--cases random --objects 30 --instances 10"}
-"""Tables of the methods with more samples."""
+AIDS = {"all": "", "bare": "--aids"}
+"""Options for every method with all aids, and without any."""
 
 BUILTIN = "--push-net builtin --grasp-net builtin"
 """Options for the networks that come with the package."""
 
+PAPER = {"gn": 500, "dipn": 1500, "rea": 1500, "rea-dipn": 2000, "dqn": 1500, "vpg": 2500}
+"""Samples of each network, as many as the paper gives it."""
+LARGE = {"gn": 5000, "dipn": 5000, "rea": 5000, "rea-dipn": 5000, "dqn": 5000, "vpg": 10_000}
+"""Samples of each network where all methods have 10,000 in all."""
+BUDGETS = {"paper": (PAPER, 3), "large": (LARGE, 2)}
+"""Samples, and number of trainings."""
+
+NOISE = {
+    "height-1mm": "--height-noise 0.001",
+    "height-2mm": "--height-noise 0.002",
+    "height-4mm": "--height-noise 0.004",
+    "holes": "--holes 0.05",
+    "image": "--image-noise 0.03",
+    "all-noise": "--height-noise 0.002 --holes 0.05 --image-noise 0.03",
+}
+"""Kinds of noise of the camera."""
+
+CHANGED = {
+    "heavy": "--cases random --objects 10 --instances 30 --density 1000 2000",
+    "slippery": "--cases random --objects 10 --instances 30 --friction 0.12 0.2",
+    "rough": "--cases random --objects 10 --instances 30 --friction 0.6 0.9",
+    "large": "--cases random --objects 10 --instances 30 --scale 1.1 1.2",
+    "packed": "--cases random --objects 8 --instances 30 --packed 1",
+}
+"""Tables on which physics or sizes are others than in training, and packed rows."""
+
 
 def list_runs(root: pathlib.Path) -> list[Run]:
-    """Return the runs of the page, which write to `root`/clear."""
+    """Return the runs of the page, which write to `root`/clear; the most telling ones first."""
     run = Recipe(root / "clear")
-    pushes = run.borrow(push_prediction.list_runs(root), "data", prefix="push")
+    _shipped(run)
+    _details(run)
+    pushes = run("pushes", "dipn-datagen push --episodes 5600")
     pretrained = run.borrow(grasping.list_runs(root), "pretrained", prefix="grasp")
-    evaluated = _paper_samples(run, pushes, pretrained)
-    evaluated += _more_samples(run)
-
-    # the shipped networks with scores and rule exactly as published
-    unguarded = "--label unguarded --no-cautious --no-remember"
-    evaluated.append(run("table/unguarded-hard", "dipn-eval clear", HARD, unguarded, BUILTIN))
-
-    run("report", "dipn-eval report --clear", sorted(evaluated), out=run.folder)
+    for budget, (samples, trainings) in BUDGETS.items():
+        for seed in range(trainings):
+            methods = _train(run, budget, samples, seed, pushes, pretrained)
+            for aids, extra in AIDS.items():
+                for on, which in TABLES.items():
+                    for method, options in methods.items():
+                        label = f"--label {budget}-{aids}-{seed}"
+                        name = f"table/{on}/{budget}/{aids}/{method}/{seed}"
+                        run(name, "dipn-eval clear", which, label, extra, *options)
     run("sweep", f"dipn-eval sweep {BUILTIN} --distances 0.03:0.12:0.01 --instances 3")
     return run.runs
 
 
-def _paper_samples(run: Recipe, pushes: pathlib.Path, pretrained: pathlib.Path) -> list[pathlib.Path]:
-    """Add every method with the samples that the paper gives it, and the shipped networks; return the evaluations."""
-    gn = run("gn", "dipn-train grasp-online --grasps 500 --init", pretrained)
-    dipn = run("dipn", "dipn-train push --limit 1500 --steps 3000 --data", pushes)
-    dipn_2000 = run("dipn-2000", "dipn-train push --limit 2000 --steps 3000 --data", pushes)
-    dqn = run("dqn", "dipn-train baseline --method dqn --actions 1500 --grasp-net", gn)
-    rea = run("rea", "dipn-train baseline --method rea --actions 1500")
-    vpg = run("vpg", "dipn-train baseline --method vpg --actions 2500")
-    methods: dict[str, tuple[Part, ...]] = {
-        "large": (f"--label large {BUILTIN}",),
-        "dipn-gn": ("--label paper --push-net", dipn, "--grasp-net", gn),
-        "vpg": ("--label paper --method vpg --value-net", vpg),
-        "rea-dipn": ("--label paper --method rea+dipn --push-net", dipn_2000, "--value-net", rea),
-        "dqn-gn": ("--label paper --method dqn+gn --value-net", dqn, "--grasp-net", gn),
+def _train(
+    run: Recipe, budget: str, samples: dict[str, int], seed: int, pushes: pathlib.Path, pretrained: pathlib.Path
+) -> dict[str, tuple[Part, ...]]:
+    """Add one training of every network; return the options of the methods that decide with them."""
+    at, seeded = f"{budget}/{seed}", f"--seed {seed}"
+    gn = run(f"{at}/gn", f"dipn-train grasp-online --grasps {samples['gn']}", seeded, "--init", pretrained)
+    learnt = "dipn-train push --steps 3000"
+    dipn = run(f"{at}/dipn", f"{learnt} --limit {samples['dipn']}", seeded, "--data", pushes)
+    if samples["rea-dipn"] == samples["dipn"]:
+        other = dipn
+    else:
+        other = run(f"{at}/rea-dipn", f"{learnt} --limit {samples['rea-dipn']}", seeded, "--data", pushes)
+    act = "dipn-train baseline --method"
+    dqn = run(f"{at}/dqn", f"{act} dqn --actions {samples['dqn']}", seeded, "--grasp-net", gn)
+    rea = run(f"{at}/rea", f"{act} rea --actions {samples['rea']}", seeded)
+    vpg = run(f"{at}/vpg", f"{act} vpg --actions {samples['vpg']}", seeded)
+    return {
+        "dipn+gn": ("--push-net", dipn, "--grasp-net", gn),
+        "gn": ("--method gn --grasp-net", gn),
+        "rea+dipn": ("--method rea+dipn --push-net", other, "--value-net", rea),
+        "dqn+gn": ("--method dqn+gn --value-net", dqn, "--grasp-net", gn),
+        "vpg": ("--method vpg --value-net", vpg),
     }
-    evaluated = _evaluate(run, methods, TABLES)
-    return evaluated + _evaluate(run, {"gn-paper": ("--label paper --method gn --grasp-net", gn)}, {"hard": HARD})
 
 
-def _more_samples(run: Recipe) -> list[pathlib.Path]:
-    """Add the compared methods with more samples, and the shipped GN without pushes; return the evaluations."""
-    dqn = run("dqn-large", "dipn-train baseline --method dqn --actions 3000 --grasp-net builtin")
-    rea = run("rea-large", "dipn-train baseline --method rea --actions 3000")
-    vpg = run("vpg-large", "dipn-train baseline --method vpg --actions 4000")
-    methods: dict[str, tuple[Part, ...]] = {
-        "vpg-large": ("--label large --method vpg --value-net", vpg),
-        "rea-dipn-large": ("--label large --method rea+dipn --push-net builtin --value-net", rea),
-        "dqn-gn-large": ("--label large --method dqn+gn --grasp-net builtin --value-net", dqn),
-        "gn-only": ("--label large --method gn --grasp-net builtin",),
-        "physics-gn": ("--label large --method physics+gn --grasp-net builtin",),
+def _shipped(run: Recipe) -> None:
+    """Add the networks that come with the package, which learnt from more than any budget here."""
+    methods = {
+        "dipn+gn": BUILTIN,
+        "gn": "--method gn --grasp-net builtin",
+        "physics+gn": "--method physics+gn --masks true --grasp-net builtin",
     }
-    return _evaluate(run, methods, FEWER_TABLES)
+    for on in ("heldout", "hard", "random-10", "random-30"):
+        for method, options in methods.items():
+            for aids, extra in AIDS.items():
+                if method != "physics+gn" or (aids == "all" and on in ("heldout", "hard")):
+                    name = f"table/{on}/shipped/{aids}/{method}/0"
+                    run(name, "dipn-eval clear", TABLES[on], f"--label shipped-{aids}", extra, options)
 
 
-def _evaluate(run: Recipe, methods: dict[str, tuple[Part, ...]], tables: dict[str, str]) -> list[pathlib.Path]:
-    """Add an evaluation of each of `methods` on each of `tables`."""
-    return [
-        run(f"table/{method}-{on}", "dipn-eval clear", which, *options)
-        for on, which in tables.items()
-        for method, options in methods.items()
-    ]
-
-
-TITLES = {
-    "completion": "completion",
-    "grasp_success_completed": "grasp success, completed",
-    "grasp_success_all": "all",
-    "efficiency_completed": "efficiency, completed",
-    "efficiency_all": "all",
-}
-"""Measures of the tables, and their titles."""
-
-
-def _cell(values: dict[str, Any], at: str) -> str:
-    if values.get(at) is None:
-        return "-"
-    value, low, high = (100 * values[f"{at}{end}"] for end in ("", "_low", "_high"))
-    return f"{value:.1f} [{low:.0f}, {high:.0f}]"
-
-
-def table(values: dict[str, Any], tables: str) -> str:
-    """Return a table of all methods on one kind of tables, in per cent, with the paper's numbers for the same."""
-    heads = [f"| {tables} | tables | pushes | " + " | ".join(TITLES.values()) + " |"]
-    lines = [*heads, "| --- " * (len(TITLES) + 3) + "|"]
-    for at in sorted({key.rpartition("/")[0] for key in values if key.startswith(f"clear/{tables}/")}):
-        name = ", ".join(reversed(at.split("/")[2:]))
-        cells = [str(values[f"{at}/instances"]), str(values[f"{at}/pushes"])]
-        cells += [_cell(values, f"{at}/{key}") for key in TITLES]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    for method, numbers in paper.TABLE.get(tables, {}).items():
-        lines.append(f"| *{method}, the paper* | | | " + " | ".join(f"{number:.1f}" for number in numbers) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def tables(values: dict[str, Any]) -> list[str]:
-    """Return all tables of the page."""
-    return [table(values, kind) for kind in sorted({key.split("/")[1] for key in values if key.startswith("clear/")})]
-
-
-def swept(values: dict[str, Any]) -> str:
-    """Return a table of what `dipn-eval sweep` found at each distance; errors are true 1-IoU of moved objects."""
-    lines = ["| push | error, moved objects | completion | grasp success | efficiency | pushes |", "| --- " * 6 + "|"]
-    for each in sweeping.names(values):
-        at = f"sweep/{each}"
-        error = values.get(f"{at}/push_error/moved")
-        name = each if error is None else f"{100 * float(each):.0f} cm"
-        cells = [_cell(values, f"{at}/{key}") for key in sweeping.SHOWN]
-        lines.append(
-            f"| {name} | {'-' if error is None else f'{error:.3f}'} | {' | '.join(cells)} | {values[f'{at}/pushes']} |"
-        )
-    return "\n".join(lines) + "\n"
+def _details(run: Recipe) -> None:
+    """Add what is measured with the shipped networks alone: masks, noise, aids, changed worlds."""
+    heldout, clear = TABLES["heldout"], "dipn-eval clear"
+    for on, which in TABLES.items():
+        run(f"masks/{on}/true", clear, which, BUILTIN, "--masks true --label true-masks")
+    for name, options in NOISE.items():
+        run(f"noise/{name}", clear, heldout, BUILTIN, options, f"--label {name}")
+    for aid in clearing_tables.ABLATED:
+        others = " ".join(other for other in clearing_tables.ABLATED if other != aid)
+        run(f"aids/without/{aid}", clear, heldout, BUILTIN, f"--aids {others} --label without-{aid}")
+        run(f"aids/alone/{aid}", clear, heldout, BUILTIN, f"--aids {aid} --label only-{aid}")
+    for name, options in CHANGED.items():
+        run(f"changed/{name}/dipn+gn", clear, options, BUILTIN, f"--label {name}")
+        run(f"changed/{name}/gn", clear, options, f"--method gn --grasp-net builtin --label {name}")
+    chosen = "--distances 0.03 0.04 0.05 0.06 0.07 0.08 0.09 0.10 0.11 0.12 --label chosen"
+    run("distance/chosen", clear, heldout, BUILTIN, chosen)
 
 
 def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
-    """Write clearing.json, sweep.json, the tables of clearing.md and its figure to `docs`."""
-    listed = list_runs(root)
-    folders = sorted(run.out for run in listed if run.name.startswith("table/"))
-    values = comparison.flat([comparison.Cleared(folder) for folder in folders])
-    values[pages.MADE] = pages.made(listed)
-    found = files.read_json(root / "clear" / "sweep" / "metrics.json")
-    sweep = {key: value for key, value in found.items() if key.startswith("sweep/")}
-    files.write_json(docs / "sweep.json", sweep)
-    pages.write("clearing", values, [*tables(values), swept(sweep)], docs=docs)
-    shutil.copy(root / "clear" / "sweep" / "sweep.png", docs / "sweep.png")
+    """Write the tables of clearing.md, clearing.json and the figure of the sweep to `docs`, from what is kept."""
+    listed, results = list_runs(root), Kept(docs / KEPT.name)
+    values = clearing_tables.numbers(listed, results)
+    tables = clearing_tables.all_tables(values)
+    values[pages.MADE] = results.made(listed)
+    folder = root / "clear" / "sweep"
+    if (folder / "metrics.json").exists():
+        found = files.read_json(folder / "metrics.json")
+        sweep = {key: value for key, value in found.items() if key.startswith("sweep/")}
+        files.write_json(docs / "sweep.json", sweep)
+        shutil.copy(folder / "sweep.png", docs / "sweep.png")
+    tables.append(clearing_tables.swept(files.read_json(docs / "sweep.json")))
+    pages.write("clearing", values, tables, docs=docs)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
-    return command.main("clearing", str(__doc__), list_runs, page=write_page, arguments=arguments)
+    return command.main(
+        "clearing",
+        str(__doc__),
+        list_runs,
+        page=write_page,
+        page_on_request=True,
+        keep_in=KEPT,
+        arguments=arguments,
+    )
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Callable, Sequence
 
 from dipn_jax import console
-from experiments import runs
+from experiments import kept, runs
 from experiments.runs import Run
 
 ListRuns = Callable[[pathlib.Path], list[Run]]
@@ -25,6 +25,7 @@ def main(
     folder: str = "results",
     page: WritePage | None = None,
     page_on_request: bool = False,
+    keep_in: pathlib.Path | None = None,
     arguments: Sequence[str] | None = None,
 ) -> int:
     """Run the command line of an experiment and return the exit code.
@@ -36,6 +37,7 @@ def main(
       folder: where results go unless `--out` says otherwise.
       page: what to write when all runs are complete.
       page_on_request: whether it is written only where `--page` asks for it, which carries out no run.
+      keep_in: file that keeps the results of evaluations; what is kept there is not carried out again.
       arguments: of the command line; those of the process if not given.
     """
     options = _parser(module, description, folder, page_on_request).parse_args(arguments)
@@ -48,11 +50,14 @@ def main(
         if page and page_on_request and options.page:
             page(options.out)
             return 0
-        found = runs.keys(listed)
+        found, after = runs.keys(listed), _forget
+        if keep_in:
+            results = kept.Kept(keep_in)
+            chosen, after = kept.missing(listed, options.only, found, results), results.keep
         if options.dry_run:
             return _rehearse(chosen, found)
         console.require_out(options.out)
-        code = runs.carry_out(chosen, found)
+        code = runs.carry_out(chosen, found, after=after)
         if not code and page and not page_on_request and len(chosen) == len(listed):
             page(options.out)
         return code
@@ -79,6 +84,10 @@ def _parser(module: str, description: str, folder: str, page_on_request: bool) -
             "--page", action="store_true", help="write the page in docs from complete runs; run nothing"
         )
     return parser
+
+
+def _forget(run: Run, key: str) -> None:
+    """Keep nothing of a run that is complete but its folder."""
 
 
 def _show(chosen: Sequence[Run]) -> int:

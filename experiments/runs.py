@@ -12,7 +12,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from dipn_jax import console, files, machine
@@ -162,12 +162,15 @@ def _seed(out: pathlib.Path) -> int | None:
     return None
 
 
-def carry_out(chosen: Sequence[Run], found: dict[str, str]) -> int:
+def carry_out(
+    chosen: Sequence[Run], found: dict[str, str], *, after: Callable[[Run, str], None] = lambda run, key: None
+) -> int:
     """Carry out the runs in order, up to the first that fails.
 
     Args:
       chosen: the runs.
       found: their `keys`.
+      after: called with each run that is complete, and its key.
 
     Returns:
       0, or the exit code of the run that failed.
@@ -177,6 +180,7 @@ def carry_out(chosen: Sequence[Run], found: dict[str, str]) -> int:
         if is_complete(run, found[run.name]):
             commits = ", ".join(made["commit"] for made in read_stamp(run)["made_by"])
             console.say(f"{title}: complete (commit {commits})")
+            after(run, found[run.name])
             continue
         console.say(f"{title}: {run.line}")
         write_stamp(run, found[run.name], complete=False)
@@ -184,6 +188,7 @@ def carry_out(chosen: Sequence[Run], found: dict[str, str]) -> int:
             print(f"error: {run.name} ended with exit code {code}; correct its cause and repeat", file=sys.stderr)
             return code
         write_stamp(run, found[run.name], complete=True)
+        after(run, found[run.name])
     return 0
 
 

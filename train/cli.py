@@ -221,7 +221,7 @@ def baseline(
         scenes.parse_objects(objects),
         config,
         out,
-        scorer=scorers.cautious_scorer(gn) if gn else None,
+        scorer=scorers.aided_scorer(gn) if gn else None,
         scored_by=checkpoint.digest(gn) if gn else "",
     )
     _say(out, result, digits=".3f")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Literal
 
 import jax
@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from dipn_jax import geometry
 from dipn_jax.errors import UserError
+from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.networks import resnet
 from dipn_jax.sight import fingers, render
 from dipn_jax.workspace import ROTATIONS, TURNED_PIXELS, WORKSPACE, grasp_angles
@@ -125,6 +126,7 @@ def score_image(
     *,
     action: Literal["grasp", "push"] = "grasp",
     squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
+    table: bool = True,
 ) -> Float[jax.Array, "16 224 224"]:
     """Return the scores of all grasps, or all pushes, of one image.
 
@@ -134,6 +136,7 @@ def score_image(
       action: grasps are scored by the `compact` network at half of the rotations, because a grasp turned by half a turn
         is the same grasp, and score 0 on empty table; pushes are scored at all rotations, and everywhere.
       squash: function from the network's outputs to scores.
+      table: whether grasps centred on empty table score 0; False: what the network says, which never learnt of any.
 
     Returns:
       Scores in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
@@ -145,29 +148,47 @@ def score_image(
         scores = jnp.tile(scores, (ROTATIONS // turns, 1, 1))
     else:
         angles = jnp.asarray(grasp_angles())
-        table = jnp.array([*render.TABLE_COLOR, 0.0])
-        views = jax.vmap(lambda a: geometry.rotate_map(image - table, a, VIEW_PIXELS) + table)(angles)
+        empty = jnp.array([*render.TABLE_COLOR, 0.0])
+        views = jax.vmap(lambda a: geometry.rotate_map(image - empty, a, VIEW_PIXELS) + empty)(angles)
         scores = squash(network(views))
         scores = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
-    return jnp.where(image[..., 3] > fingers.EMPTY_HEIGHT, scores, 0.0) if action == "grasp" else scores
+    return jnp.where(image[..., 3] > fingers.EMPTY_HEIGHT, scores, 0.0) if action == "grasp" and table else scores
 
 
-def cautious_scores(network: GraspNet, image: Float[jax.Array, "224 224 4"]) -> Float[jax.Array, "16 224 224"]:
-    """Return the least score of a grasp and its three mirror images, halved where fingers are blocked.
+def aided_scores(
+    network: GraspNet,
+    image: Float[jax.Array, "224 224 4"],
+    *,
+    aids: Collection[Aid] = ALL_AIDS,
+    squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
+) -> Float[jax.Array, "16 224 224"]:
+    """Return the scores of all grasps to choose one by, with some of the aids of `names.Aid`.
 
-    A mirror image of a grasp is as good as the grasp, and both mirrors map the 16 angles onto themselves, so there are
-    four scores of each grasp. The best of a million scores is an overestimate; the least of four makes up for it.
-    Grasps that the height map shows as blocked (`fingers.blocked_image`) get half the score: of those that the network
-    scores high, four in ten hold, of the others 99 % (docs/clearing.md).
+    mirrors: a mirror image of a grasp is as good as the grasp, and both mirrors map the 16 angles onto themselves, so
+    there are four scores of each grasp. The best of a million scores is an overestimate; the least of four makes up
+    for it. fingers, border: blocked grasps (`fingers.blocked_image`) get half the score. What each aid is worth is in
+    docs/clearing.md.
+
+    Args:
+      network: GN, or another of its kind, in evaluation mode.
+      image: RGB in [0, 1] and height in metres.
+      aids: those wanted; `still` and `memory` are not about scores of one image.
+      squash: function from the network's outputs to scores.
     """
-    turned_back = -np.arange(ROTATIONS) % ROTATIONS
+    score = functools.partial(score_image, network, squash=squash, table="table" in aids)
+    scores = score(image)
+    if "mirrors" in aids:
+        scores = functools.reduce(jnp.minimum, [_mirrored(score, image, axes) for axes in ((0,), (1,), (0, 1))], scores)
+    if "fingers" in aids or "border" in aids:
+        blocked = fingers.blocked_image(image[..., 3], inside="fingers" in aids, beyond="border" in aids)
+        scores = jnp.minimum(scores, scores * (1 - blocked / 2))  # values may be negative
+    return scores
 
-    def mirrored(axes: tuple[int, ...]) -> jax.Array:
-        scores = jnp.flip(score_image(network, jnp.flip(image, axes)), [axis + 1 for axis in axes])
-        return scores[turned_back] if len(axes) == 1 else scores
 
-    answers = [score_image(network, image), mirrored((0,)), mirrored((1,)), mirrored((0, 1))]
-    return functools.reduce(jnp.minimum, answers) * (1 - fingers.blocked_image(image[..., 3]) / 2)
+def _mirrored(score: Callable[[jax.Array], jax.Array], image: jax.Array, axes: tuple[int, ...]) -> jax.Array:
+    """Return the scores of the image mirrored along `axes`, each in the place of the grasp that it mirrors."""
+    scores = jnp.flip(score(jnp.flip(image, axes)), [axis + 1 for axis in axes])
+    return scores[-np.arange(ROTATIONS) % ROTATIONS] if len(axes) == 1 else scores
 
 
 def score_cells(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, Key
 
 from dipn_jax.errors import UserError
-from dipn_jax.names import MethodName
+from dipn_jax.names import ALL_AIDS, Aid, MethodName
 from dipn_jax.networks import vpg
 from dipn_jax.planning import planner, predictors, scorers
 from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
@@ -79,12 +79,13 @@ class PolicyConfig:
     gamma: float = 0.9
     grasp_above: float = 0.7
     released: bool = False  # with the clauses of DIPN's released code
-    cautious: bool = True  # GN's scores are the lowest of four mirrored ones; False: GN as published
+    aids: tuple[Aid, ...] = ALL_AIDS  # what no paper has; `memory` is for the caller, who gives the misses
 
     def rule(self) -> Rule:
         """Return the rule that the planner compares by."""
         rule = planner.RELEASED if self.released else Rule()
-        result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above)
+        small = "still" not in self.aids
+        result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above, draw_all=small)
         return result
 
     def spread(self) -> Float[np.ndarray, " P"]:
@@ -214,7 +215,8 @@ def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSum
 
     The clauses of the released code need the highest score of every image, so images are then scored whole.
     """
-    return scorers.load_scorer(run, cautious=config.cautious), scorers.load_summary(run, whole=config.released)
+    summary = scorers.load_summary(run, whole=config.released, table="table" in config.aids)
+    return scorers.load_scorer(run, aids=config.aids), summary
 
 
 def _dipn_gn(runs: Runs, config: PolicyConfig) -> Policy:
@@ -223,27 +225,29 @@ def _dipn_gn(runs: Runs, config: PolicyConfig) -> Policy:
 
 
 def _rea_dipn(runs: Runs, config: PolicyConfig) -> Policy:
-    summary = scorers.load_summary(runs["value"], network="vpg", whole=config.released)
-    act = imagining(predictors.load_predictor(runs["push"]), _chances(runs["value"]), summary)
+    table = "table" in config.aids
+    summary = scorers.load_summary(runs["value"], network="vpg", whole=config.released, table=table)
+    act = imagining(predictors.load_predictor(runs["push"]), _chances(runs["value"], config.aids), summary)
     return Policy(act, config.rule(), config.spread())
 
 
 def _dqn_gn(runs: Runs, config: PolicyConfig) -> Policy:
-    scorer = scorers.load_scorer(runs["grasp"], cautious=config.cautious)
+    scorer = scorers.load_scorer(runs["grasp"], aids=config.aids)
     act = comparing(_part(runs["value"], "push"), scorer, grasp_at_once=True)
     return Policy(act, config.rule(), config.spread())
 
 
 def _vpg(runs: Runs, config: PolicyConfig) -> Policy:
-    act = comparing(_part(runs["value"], "push"), _part(runs["value"], "grasp"), grasp_at_once=False)
+    pushes, grasps = _part(runs["value"], "push"), _part(runs["value"], "grasp", config.aids)
+    act = comparing(pushes, grasps, grasp_at_once=False)
     return Policy(act, config.rule(), config.spread())
 
 
 def _gn(runs: Runs, config: PolicyConfig) -> Policy:
-    return grasping_policy(scorers.load_scorer(runs["grasp"], cautious=config.cautious))
+    return grasping_policy(scorers.load_scorer(runs["grasp"], aids=config.aids))
 
 
-def _chances(run: pathlib.Path) -> Scorer:
+def _chances(run: pathlib.Path, aids: tuple[Aid, ...]) -> Scorer:
     """Return the scorer of the grasps of REA.
 
     Raises:
@@ -254,16 +258,16 @@ def _chances(run: pathlib.Path) -> Scorer:
         raise UserError(
             f"--value-net {run}: predicts values, not chances; give a run of dipn-train baseline --method rea"
         )
-    return _part(run, "grasp")
+    return _part(run, "grasp", aids)
 
 
-def _part(run: pathlib.Path, name: str) -> Scorer:
+def _part(run: pathlib.Path, name: str, aids: tuple[Aid, ...] = ()) -> Scorer:
     """Return the scorer of pushes or of grasps of a baseline.
 
     Raises:
       UserError: it was trained without.
     """
-    found = scorers.load_values(run)[vpg.PARTS.index(name)]
+    found = scorers.load_values(run, aids=aids)[vpg.PARTS.index(name)]
     if found is None:
         raise UserError(
             f"--value-net {run}: was not trained to {name}; give a run of another dipn-train baseline --method"

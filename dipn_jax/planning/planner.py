@@ -51,6 +51,7 @@ class Rule(Pytree):
     edge_factor: Float[Array, ""] | float = (
         1.0  # a predicted motion is multiplied by it to judge whether an object leaves the workspace
     )
+    draw_all: Bool[Array, ""] | bool = False  # draw also motions below UNDRAWN_SHIFT and UNDRAWN_TURN
     # clauses that only DIPN's released code has
     grasp_lone: Bool[Array, ""] | bool = False  # a lone object is grasped
     push_must_raise_best: Bool[Array, ""] | bool = False  # a push must raise the best score, too
@@ -116,7 +117,7 @@ def decide_among(
     centers, area = masks.mask_centers(observation.label, observation.slots)
     small = jnp.linalg.norm(motion[..., :2], axis=-1) < UNDRAWN_SHIFT
     small &= jnp.abs(motion[..., 2]) < UNDRAWN_TURN
-    drawn = jnp.where(small[..., None], 0.0, motion)
+    drawn = jnp.where(small[..., None] & ~jnp.asarray(rule.draw_all), 0.0, motion)
     inside = jax.vmap(candidates.stays_inside, in_axes=(None, None, 0))(centers, area, rule.edge_factor * motion)
     allowed = found.feasible & inside & ~found.grasp_now
     now = render.rgbd(observation)

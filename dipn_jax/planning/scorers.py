@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Literal
 
 import jax
 from flax import nnx
 
+from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.networks import grasp, local, vpg
 from dipn_jax.planning import planner
 from dipn_jax.planning.planner import Scorer, ScoreSummary
 from dipn_jax.storage import checkpoint
+
+TABLE_AID: tuple[Aid, ...] = ("table",)
+"""The one aid that the compared networks' grasps are learnt with."""
 
 
 def _frozen(model: nnx.Module) -> Callable[[], nnx.Module]:
@@ -32,24 +36,26 @@ def _scorer(model: nnx.Module, score: Callable[[Any, jax.Array], jax.Array]) -> 
     return scores
 
 
-def cautious_scorer(model: grasp.GraspNet) -> Scorer:
-    """Return GN as a scorer to choose by: `grasp.cautious_scores` of `compact`, plain scores of `paper`."""
-    return _scorer(model, grasp.cautious_scores if model.config.preset == "compact" else grasp.score_image)
+def aided_scorer(model: grasp.GraspNet, *, aids: Collection[Aid] = ALL_AIDS) -> Scorer:
+    """Return GN as a scorer to choose grasps by, with some of the aids of `names.Aid`."""
+    return _scorer(model, functools.partial(grasp.aided_scores, aids=tuple(aids)))
 
 
-def plain_scorer(model: grasp.GraspNet) -> Scorer:
-    """Return GN as a scorer with its scores as they are."""
-    return _scorer(model, grasp.score_image)
+def plain_scorer(model: grasp.GraspNet, *, table: bool = True) -> Scorer:
+    """Return GN as a scorer with its scores as they are; grasps centred on empty table score 0 unless `table` is
+    False.
+    """
+    return _scorer(model, functools.partial(grasp.score_image, table=table))
 
 
-def grasp_summary(model: grasp.GraspNet) -> ScoreSummary:
+def grasp_summary(model: grasp.GraspNet, *, table: bool = True) -> ScoreSummary:
     """Return the function that summarizes scores of imagined images, the fast way where there is one.
 
-    `compact` networks on a CPU score only what moved; elsewhere images are scored whole. The highest score of the fast
-    way is not that of the image.
+    `compact` networks on a CPU score only what moved; elsewhere, and where empty table counts (`table` False), images
+    are scored whole. The highest score of the fast way is not that of the image.
     """
-    if model.config.preset != "compact" or jax.default_backend() != "cpu":
-        return planner.summarize_whole(plain_scorer(model))
+    if model.config.preset != "compact" or jax.default_backend() != "cpu" or not table:
+        return planner.summarize_whole(plain_scorer(model, table=table))
     thaw = _frozen(model)
 
     def summarize(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -58,39 +64,48 @@ def grasp_summary(model: grasp.GraspNet) -> ScoreSummary:
     return summarize
 
 
-def value_scorers(model: vpg.VPG) -> tuple[Scorer | None, Scorer | None]:
-    """Return the scorers of pushes and of grasps of a baseline's network; None where it has no such part."""
+def value_scorers(model: vpg.VPG, *, aids: Collection[Aid] = TABLE_AID) -> tuple[Scorer | None, Scorer | None]:
+    """Return the scorers of pushes and of grasps of a baseline's network; None where it has no such part.
+
+    Args:
+      model: the network.
+      aids: that grasps are chosen with; pushes have none.
+    """
     squash = nnx.sigmoid if model.config.answers == "chance" else (lambda x: x)
+    push, grasps = (getattr(model, name) if name in model.config.parts else None for name in vpg.PARTS)
+    score_push = functools.partial(grasp.score_image, action="push", squash=squash)
+    score_grasp = functools.partial(grasp.aided_scores, aids=tuple(aids), squash=squash)
+    return (
+        None if push is None else _scorer(push, score_push),
+        None if grasps is None else _scorer(grasps, score_grasp),
+    )
 
-    def scorer(name: Literal["push", "grasp"]) -> Scorer | None:
-        if name not in model.config.parts:
-            return None
-        return _scorer(getattr(model, name), functools.partial(grasp.score_image, action=name, squash=squash))
 
-    return scorer("push"), scorer("grasp")
-
-
-def load_scorer(run: pathlib.Path | str, *, cautious: bool = True) -> Scorer:
-    """Load the scorer of a `dipn-train grasp` run, or `builtin`, to choose grasps by.
+def load_scorer(run: pathlib.Path | str, *, aids: Collection[Aid] = ALL_AIDS) -> Scorer:
+    """Load the scorer of a `dipn-train grasp` run, or `builtin`, to choose grasps by, with some of the aids.
 
     Raises:
       UserError: as `checkpoint.load_network`.
     """
     model: Any = checkpoint.load_network(pathlib.Path(run), network="grasp")
-    return cautious_scorer(model) if cautious else plain_scorer(model)
+    return aided_scorer(model, aids=aids)
 
 
-def load_values(run: pathlib.Path | str) -> tuple[Scorer | None, Scorer | None]:
+def load_values(run: pathlib.Path | str, *, aids: Collection[Aid] = TABLE_AID) -> tuple[Scorer | None, Scorer | None]:
     """Load the scorers of pushes and grasps of a `dipn-train baseline` run; None for a part that was not trained.
 
     Raises:
       UserError: as `checkpoint.load_network`.
     """
-    return value_scorers(checkpoint.load_network(pathlib.Path(run), network="vpg"))  # type: ignore[arg-type]
+    return value_scorers(checkpoint.load_network(pathlib.Path(run), network="vpg"), aids=aids)  # type: ignore[arg-type]
 
 
 def load_summary(
-    run: pathlib.Path | str, *, network: Literal["grasp", "vpg"] = "grasp", whole: bool = False
+    run: pathlib.Path | str,
+    *,
+    network: Literal["grasp", "vpg"] = "grasp",
+    whole: bool = False,
+    table: bool = True,
 ) -> ScoreSummary:
     """Load the function that summarizes a network's scores of imagined images by mean and highest.
 
@@ -98,10 +113,11 @@ def load_summary(
       run: of `dipn-train grasp` (or `builtin`), or of `dipn-train baseline`.
       network: GN (`grasp`), or the grasps of a baseline (`vpg`).
       whole: score every image whole; the fast way does not know the highest score on each.
+      table: whether grasps centred on empty table score 0.
 
     Raises:
       UserError: as `checkpoint.load_network`.
     """
     model: Any = checkpoint.load_network(pathlib.Path(run), network=network)
     grasps = model.grasp if network == "vpg" else model
-    return planner.summarize_whole(plain_scorer(grasps)) if whole else grasp_summary(grasps)
+    return planner.summarize_whole(plain_scorer(grasps, table=table)) if whole else grasp_summary(grasps, table=table)

@@ -128,24 +128,32 @@ def label_image(height: Float[Array, "224 224"]) -> Float[jax.Array, "16 224 224
     return _of_every_grasp(height, geometric_labels)
 
 
-def blocked_image(height: Float[Array, "224 224"]) -> Float[jax.Array, "16 224 224"]:
+def blocked_image(
+    height: Float[Array, "224 224"], *, inside: bool = True, beyond: bool = True
+) -> Float[jax.Array, "16 224 224"]:
     """Return 1 for each grasp on a height map whose finger would land on something, else 0.
 
-    It would come down on something that stands BLOCKED_HEIGHT over where its tip is to go, or out of sight near
-    something that reaches the border.
+    Args:
+      height: metres.
+      inside: count what is seen to stand BLOCKED_HEIGHT over where a fingertip is to go.
+      beyond: count what is out of sight: something that reaches the border is assumed to extend beyond it.
     """
     height = jnp.pad(height, (TURNED_PIXELS - WORKSPACE.pixels) // 2, mode="edge")
     outside = jnp.abs(jnp.arange(TURNED_PIXELS) - (TURNED_PIXELS - 1) / 2) > WORKSPACE.pixels / 2
-    beyond = jnp.where(outside[:, None] | outside, height, 0.0)
-    hidden = jax.lax.reduce_window(beyond, 0.0, jax.lax.max, (2 * HIDDEN_WIDTH + 1,) * 2, (1, 1), "SAME") > EMPTY_HEIGHT
-    height = jnp.where((outside[:, None] | outside) & hidden, HIDDEN_HEIGHT, height)
-    return _of_every_grasp(
-        height, lambda turned: (_under_fingers(turned) > grasp_height(turned) + BLOCKED_HEIGHT).astype(jnp.float32)
-    )
+    outside = outside[:, None] | outside
+    cut = jnp.where(outside, height, 0.0)
+    hidden = jax.lax.reduce_window(cut, 0.0, jax.lax.max, (2 * HIDDEN_WIDTH + 1,) * 2, (1, 1), "SAME") > EMPTY_HEIGHT
+    obstacles = jnp.where(outside, jnp.where(hidden & beyond, HIDDEN_HEIGHT, 0.0), height if inside else 0.0)
+
+    def judge(turned: jax.Array) -> jax.Array:
+        goal = grasp_height(turned[..., 0]) + BLOCKED_HEIGHT
+        return (_under_fingers(turned[..., 1]) > goal).astype(jnp.float32)
+
+    return _of_every_grasp(jnp.stack([height, obstacles], -1), judge)
 
 
 def _of_every_grasp(
-    height: Float[Array, "H W"], judge: Callable[[jax.Array], jax.Array]
+    height: Float[Array, "H W *maps"], judge: Callable[[jax.Array], jax.Array]
 ) -> Float[jax.Array, "16 224 224"]:
     """Apply `judge` to turned views and turn the results back; a grasp turned by half a turn is the same grasp."""
 

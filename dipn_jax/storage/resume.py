@@ -18,7 +18,8 @@ FORMAT_VERSION = 1
 class Partial:
     """The state of unfinished work, in `OUT/partial.npz`; one of other settings, inputs or sources is not taken up.
 
-    `networks` holds step and digest of each run among the inputs, by its name.
+    `networks` holds step and digest of each run among the inputs, `files` the SHA-256 of each file, by their names;
+    `code` is the digest of our sources and of the versions of packages.
     """
 
     def __init__(self, out: pathlib.Path, settings: dict[str, Any], *, inputs: Sequence[pathlib.Path] = ()) -> None:
@@ -34,6 +35,7 @@ class Partial:
         named = {key: str(value) for key, value in settings.items() if not _has_path(value)}
         self.identity = json.dumps([FORMAT_VERSION, named, content])
         self.networks = {str(path): checkpoint.used(path) for path in inputs if not path.is_file()}
+        self.files = {str(path): files.file_sha256(path) for path in inputs if path.is_file()}
         self.code = files.code_digest(*_stages())
 
     def load(self, fresh: Any) -> Any:

@@ -17,10 +17,17 @@ from dipn_jax.structs import ABSENT, Scene
 from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 from dipn_jax.world import scenes, shapes
 
+_DATA = pathlib.Path(__file__).parents[1] / "data"
+
 
 def hard_cases_path() -> pathlib.Path:
     """Return the path of the ten hard cases that come with the package."""
-    return pathlib.Path(__file__).parents[1] / "data" / "hard_cases.json"
+    return _DATA / "hard_cases.json"
+
+
+def heldout_cases_path() -> pathlib.Path:
+    """Return the path of the fifteen cases that come with the package and by which nothing is chosen."""
+    return _DATA / "heldout_cases.json"
 
 
 def load_cases(

@@ -10,11 +10,13 @@ import zlib
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.sight import imagine, masks, render
-from dipn_jax.structs import Scene
+from dipn_jax.structs import Array, Scene
+from dipn_jax.workspace import WORKSPACE
 
 from .instances import Instance
 
@@ -29,7 +31,9 @@ class Film:
     push: np.ndarray  # [T, 4] x, y (metres), angle (radians), distance (metres) of the best push
     grasp: np.ndarray  # [T, 3] rotation, row, column of the best grasp
     values: np.ndarray  # [T, 3] its score; mean score now; gamma times the mean after the push, -inf if none
-    motion: np.ndarray  # [T, N, 3] dx, dy (metres), dtheta (radians) predicted for the push
+    motion: np.ndarray  # [T, N, 3] dx, dy (metres), dtheta (radians) predicted for the push, of each mask
+    label: np.ndarray  # [T, H, W] int8: masks that the policy decided on
+    missed: np.ndarray  # [T, M, 3] grasps that it knew to have missed
     size: np.ndarray  # [N, 3] metres
     color: np.ndarray  # [N, 3]
     mass: np.ndarray  # [N] kg
@@ -46,16 +50,30 @@ class Film:
         def scene(at: int) -> Scene:
             return Scene(self.shape[at], self.size, self.color, self.mass, self.friction)
 
-        seen = render.render(scene(step), self.poses[step])
+        seen = render.render(scene(step), self.poses[step]).replace(label=self.label[step].astype(np.int32))
         centers, _ = masks.mask_centers(seen.label, self.shape.shape[1])
         predicted = imagine.imagine(seen, centers, self.motion[step])
         after = render.render(scene(step + 1), self.poses[step + 1])
         return np.asarray(seen.color), np.asarray(predicted.color), np.asarray(after.color)
 
 
+def packed(label: Int[Array, "H W"]) -> np.ndarray:
+    """Return labels compressed, to be kept in an interrupted evaluation."""
+    return np.frombuffer(zlib.compress(np.asarray(label, np.int8).tobytes()), np.uint8)
+
+
+def _unpacked(label: np.ndarray) -> np.ndarray:
+    """Return the labels `[H, W]` int8 of `packed`."""
+    side = WORKSPACE.pixels
+    return np.frombuffer(zlib.decompress(label.tobytes()), np.int8).reshape(side, side)
+
+
 def save(path: pathlib.Path, instance: Instance) -> None:
     """Write the film of a table that has ended."""
-    steps: dict[str, Any] = {key: np.stack([step[key] for step in instance.film]) for key in instance.film[0]}
+    steps: dict[str, Any] = {}
+    for key in instance.film[0]:
+        each = [step[key] for step in instance.film]
+        steps[key] = np.stack([_unpacked(one) for one in each] if key == "label" else each)
     steps["shape"] = np.concatenate([steps["shape"], instance.scene.shape[None]])
     steps["poses"] = np.concatenate([steps["poses"], instance.poses[None]])
     scene = {key: getattr(instance.scene, key) for key in ("size", "color", "mass", "friction")}

@@ -48,12 +48,19 @@ class Instance:
 
 
 def hard_instances(
-    engine: Engine, path: pathlib.Path, names: list[str] | None, *, slots: int, repeats: int, seed: int
+    engine: Engine,
+    path: pathlib.Path,
+    names: list[str] | None,
+    *,
+    slots: int,
+    repeats: int,
+    seed: int,
+    perturbed: bool = True,
 ) -> list[Instance]:
-    """Return the settled cases of a file, `repeats` of each; all but the first are slightly different.
+    """Return the settled cases of a file, `repeats` of each, all slightly different.
 
     Their objects are moved by up to JITTER, their masses and frictions multiplied by random factors. A repeat of a case
-    does not depend on how many others there are.
+    does not depend on how many others there are. Not `perturbed`, they are taken as they are placed.
 
     Raises:
       UserError: a name is not in the file.
@@ -66,13 +73,12 @@ def hard_instances(
     index = np.array([found.index(name) for name in wanted for _ in range(repeats)])
     scene, poses = structs.take(scene, index), poses[index].copy()
     mass, friction = np.array(scene.mass), np.array(scene.friction)
-    for row, case in enumerate(index):
-        if repeat := row % repeats:
-            rng = np.random.default_rng([seed, case, repeat])
-            reach, angle = JITTER * np.sqrt(rng.uniform(size=slots)), rng.uniform(0, 2 * np.pi, slots)
-            poses[row, :, :2] += reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-            mass[row] *= rng.uniform(*MASS_FACTOR, slots)
-            friction[row] *= rng.uniform(*FRICTION_FACTOR, slots)
+    for row, case in enumerate(index if perturbed else ()):
+        rng = np.random.default_rng([seed, case, row % repeats])
+        reach, angle = JITTER * np.sqrt(rng.uniform(size=slots)), rng.uniform(0, 2 * np.pi, slots)
+        poses[row, :, :2] += reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+        mass[row] *= rng.uniform(*MASS_FACTOR, slots)
+        friction[row] *= rng.uniform(*FRICTION_FACTOR, slots)
     scene = scene.replace(mass=mass, friction=friction)
     rollout = primitives.settle(engine, scene, poses)
     wrong = np.flatnonzero(np.asarray(rollout.fault) & (Fault.UNUSABLE | Fault.OUTSIDE))

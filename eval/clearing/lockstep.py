@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -62,22 +63,21 @@ def clear(
     """
     total = sum(instance.objects for instance in instances)
     instances = partial.load(instances)
-    keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(instances))]
     with console.Progress("clear", total, unit="objects", done=sum(i.removed for i in instances)) as progress:
         while active := [number for number, instance in enumerate(instances) if not instance.ended]:
             rows = [instances[number] for number in active]
             before = sum(instance.removed for instance in instances)
             scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
-            now = jnp.stack([jax.random.fold_in(keys[number], instances[number].actions) for number in active])
+            now = jnp.stack([action_key(seed, number, instances[number].actions) for number in active])
             missed = np.stack([_missed(row) if remember else _NONE_MISSED for row in rows])
-            decision = decide(now, scene, poses, missed)
+            decision, label = decide(now, scene, poses, missed)
             for is_push, act in ((True, functools.partial(_push, longest=longest)), (False, _grasp)):
                 which = np.flatnonzero(decision.is_push == is_push)
                 if len(which):
                     act([rows[i] for i in which], decision[which], engine)
             for i, instance in enumerate(rows):
                 state = np.asarray(scene.shape[i]), poses[i]
-                _record(instance, state, decision[i])
+                _record(instance, state, decision[i], np.asarray(label[i]), missed[i])
                 _update_missed(instance, state, np.asarray(decision.grasp_pixel[i]))
                 instance.ended = instance.ended or _ended(instance)
             partial.save(instances)
@@ -85,6 +85,11 @@ def clear(
             done = sum(bool(instance.ended) for instance in instances)
             progress.advance(removed, f"{done}/{len(instances)} tables ended")
     return instances
+
+
+def action_key(seed: int, number: int, action: int) -> jax.Array:
+    """Return the random key of one action on one table: of the noise of its image, and of the push candidates."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), number), action)
 
 
 def _push(rows: list[Instance], decision: Decision, engine: Engine, *, longest: float) -> None:
@@ -111,8 +116,14 @@ def _grasp(rows: list[Instance], decision: Decision, engine: Engine) -> None:
         instance.did.append("grasp held" if held[i].any() else "grasp missed")
 
 
-def _record(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: Decision) -> None:
-    """Record what an episode's pictures can be rendered from: the poses before the action, and the decision."""
+def _record(
+    instance: Instance,
+    state: tuple[np.ndarray, np.ndarray],
+    decision: Decision,
+    label: np.ndarray,
+    missed: np.ndarray,
+) -> None:
+    """Record what an episode's pictures can be made from: the poses before the action, what was known, the decision."""
     push = decision.push
     instance.film.append(
         {
@@ -122,6 +133,8 @@ def _record(instance: Instance, state: tuple[np.ndarray, np.ndarray], decision: 
             "grasp": np.asarray(decision.grasp_pixel),
             "values": np.array([decision.grasp_score, decision.value_now, decision.value_push], np.float32),
             "motion": np.asarray(decision.motion, np.float32),
+            "label": film.packed(label),
+            "missed": missed,
         }
     )
 
@@ -151,19 +164,28 @@ def _ended(instance: Instance) -> str:
     return "out of actions" if instance.actions >= ACTIONS_PER_OBJECT * instance.objects else ""
 
 
-def summary(instances: list[Instance]) -> dict[str, Any]:
-    """Return flat metrics, each with a bootstrap 95 % interval over instances (`_low`, `_high`).
+class Counted(Protocol):
+    """What is counted of a table that has ended."""
 
-    As in the paper: completion is instances cleared over instances, grasp success is objects grasped over grasp
-    actions, efficiency is objects removed over all actions; the last two over all instances and over completed ones,
-    summed before they are divided. A grasp may lift two objects, so `grasps_that_held` stands beside.
+    ended: str
+    objects: int
+    removed: int
+    held: int
+    grasps: int
+    pushes: int
+
+
+def counts(tables: Sequence[Counted]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return hits and trials of each table `[I]` by measure; a measure is the sum of its hits over that of its trials.
+
+    `grasp_success` counts objects and may pass 1, because a grasp may lift two; `grasps_that_held` counts grasps.
     """
-    done = np.array([instance.ended == "cleared" for instance in instances])
-    removed = np.array([instance.removed for instance in instances])
-    held = np.array([instance.held for instance in instances])
-    grasps = np.array([instance.grasps for instance in instances])
-    actions = np.array([instance.actions for instance in instances])
-    rows = {
+    done = np.array([table.ended == "cleared" for table in tables])
+    removed, held, grasps, pushes = (
+        np.array([getattr(table, name) for table in tables]) for name in ("removed", "held", "grasps", "pushes")
+    )
+    actions = grasps + pushes
+    return {
         "completion": (done, np.ones(len(done))),
         "grasp_success_all": (removed, grasps),
         "grasp_success_completed": (removed * done, grasps * done),
@@ -171,11 +193,23 @@ def summary(instances: list[Instance]) -> dict[str, Any]:
         "efficiency_all": (removed, actions),
         "efficiency_completed": (removed * done, actions * done),
     }
+
+
+def summary(instances: list[Instance]) -> dict[str, Any]:
+    """Return flat metrics, each with a bootstrap 95 % interval over cases, then their repeats (`_low`, `_high`).
+
+    As in the paper: completion is instances cleared over instances, grasp success is objects grasped over grasp
+    actions, efficiency is objects removed over all actions; the last two over all instances and over completed ones,
+    summed before they are divided. A grasp may lift two objects, so `grasps_that_held` stands beside.
+    """
+    rows = counts(instances)
+    cases = [instance.name for instance in instances]
     result: dict[str, Any] = {}
     for name, (hits, trials) in rows.items():
-        value, low, high = metrics.ratio_interval(hits, trials)
+        value, low, high = metrics.ratio_interval(hits, trials, groups=cases)
         result |= {name: value, f"{name}_low": low, f"{name}_high": high}
-    result |= {"instances": len(instances), "grasps": int(grasps.sum()), "pushes": int((actions - grasps).sum())}
+    grasps, pushes = (sum(getattr(instance, kind) for instance in instances) for kind in ("grasps", "pushes"))
+    result |= {"instances": len(instances), "grasps": grasps, "pushes": pushes}
     for reason in ("cleared", "pushed out", "out of actions", "fault"):
         result[f"ended_{reason.replace(' ', '_')}"] = sum(instance.ended == reason for instance in instances)
     return result
@@ -196,6 +230,7 @@ def save(instances: list[Instance], out: pathlib.Path) -> None:
                 "ended": instance.ended,
                 "objects": instance.objects,
                 "removed": instance.removed,
+                "held": instance.held,
                 "grasps": instance.grasps,
                 "pushes": instance.pushes,
             }

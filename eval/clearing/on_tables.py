@@ -10,19 +10,23 @@ import jax.numpy as jnp
 
 from dipn_jax import batching
 from dipn_jax.engine import Engine
+from dipn_jax.errors import UserError
 from dipn_jax.planning import methods
 from dipn_jax.planning.methods import Act, Networks, Policy, PolicyConfig
 from dipn_jax.planning.planner import Rule
-from dipn_jax.sight import render
-from dipn_jax.structs import Array, Decision, Scene
+from dipn_jax.structs import Array, Decision, Observation, Scene
 
 from . import rollouts
+from .camera import DEFAULT_CAMERA, Camera
 
-TablePolicy = Callable[[jax.Array, Scene, Array, Array], Decision]
-"""(keys [B], scenes [B, N], poses [B, N, 7], grasps that missed [B, M, 3]) -> brief decisions [B], NumPy."""
+TablePolicy = Callable[[jax.Array, Scene, Array, Array], tuple[Decision, Array]]
+"""(keys [B], scenes [B, N], poses [B, N, 7], grasps that missed [B, M, 3]) -> brief decisions [B], and the masks
+[B, H, W] that they rest on; both NumPy."""
 
 
-def load(method: str, networks: Networks, engine: Engine, configs: list[PolicyConfig]) -> list[TablePolicy]:
+def load(
+    method: str, networks: Networks, engine: Engine, configs: list[PolicyConfig], *, camera: Camera = DEFAULT_CAMERA
+) -> list[TablePolicy]:
     """Load a method once and return its policy for each of several configs; they share compiled programs.
 
     Args:
@@ -30,28 +34,31 @@ def load(method: str, networks: Networks, engine: Engine, configs: list[PolicyCo
       networks: runs.
       engine: physics, for `physics+gn`.
       configs: equal in everything, the number of candidates included, except distances and rule.
+      camera: what the policy sees; `physics+gn` needs the simulator's masks without noise.
 
     Raises:
-      UserError: a network that the method needs was not given, or is another.
+      UserError: a network that the method needs was not given, or is another; or a camera for `physics+gn`.
     """
     build, runs = methods.find(method).build, networks.runs(method)
     if build is None:
+        if camera.noisy or camera.masks != "true":
+            raise UserError(f"--method {method}: decides on the simulator's state; give --masks true, and no noise")
         scorer, summarize = methods.gn_scores(runs["grasp"], configs[0])
         decide = functools.partial(rollouts.decide, scorer=scorer, summarize=summarize, engine=engine)
         return [functools.partial(decide, rule=each.rule(), distances=each.spread()) for each in configs]
     policy = build(runs, configs[0])
     if not methods.find(method).pushes:
-        return [in_lockstep(policy)] * len(configs)
-    return [in_lockstep(policy.with_config(each)) for each in configs]
+        return [in_lockstep(policy, camera=camera)] * len(configs)
+    return [in_lockstep(policy.with_config(each), camera=camera) for each in configs]
 
 
-def in_lockstep(policy: Policy) -> TablePolicy:
-    """Make a policy of one table into one of many, which are rendered and decided on in one call."""
+def in_lockstep(policy: Policy, *, camera: Camera = DEFAULT_CAMERA) -> TablePolicy:
+    """Make a policy of one table into one of many, which are looked at and decided on together."""
 
-    def decide(keys: jax.Array, scene: Scene, poses: Array, missed: Array) -> Decision:
+    def decide(keys: jax.Array, scene: Scene, poses: Array, missed: Array) -> tuple[Decision, Array]:
+        seen = camera.look(keys, scene, poses)
         each = functools.partial(_decide_each, act=policy.act, rule=policy.rule, distances=policy.distances)
-        decisions: Decision = batching.in_small_batches(each, keys, scene, poses, missed)
-        return decisions
+        return batching.in_small_batches(each, keys, seen, missed), seen.label
 
     return decide
 
@@ -59,8 +66,7 @@ def in_lockstep(policy: Policy) -> TablePolicy:
 @functools.partial(jax.jit, static_argnames="act")
 def _decide_each(
     keys: jax.Array,
-    scene: Scene,
-    poses: jax.Array,
+    seen: Observation,
     missed: jax.Array,
     real: jax.Array,
     *,
@@ -70,11 +76,11 @@ def _decide_each(
 ) -> Decision:
     """Decide on the tables that are real, one after another: a decision is itself a batch of images."""
 
-    def one(key: jax.Array, scene: Scene, poses: jax.Array, missed: jax.Array) -> Decision:
-        return act(key, render.render(scene, poses), missed, rule, distances).brief()
+    def one(key: jax.Array, observation: Observation, misses: jax.Array) -> Decision:
+        return act(key, observation, misses, rule, distances).brief()
 
-    def some(args: tuple[jax.Array, Scene, jax.Array, jax.Array, jax.Array]) -> Decision:
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, *args[:4]))
-        return jax.lax.cond(args[4], lambda: one(*args[:4]), lambda: nothing)
+    def some(args: tuple[jax.Array, Observation, jax.Array, jax.Array]) -> Decision:
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, *args[:3]))
+        return jax.lax.cond(args[3], lambda: one(*args[:3]), lambda: nothing)
 
-    return jax.lax.map(some, (keys, scene, poses, missed, real))
+    return jax.lax.map(some, (keys, seen, missed, real))

@@ -28,7 +28,7 @@ def decide(
     engine: Engine,
     rule: Rule,
     distances: np.ndarray,
-) -> Decision:
+) -> tuple[Decision, Array]:
     """Decide on the tables `[B]` by Alg. 2 with the engine as predictor: it knows shapes, guesses mass and friction.
 
     Args:
@@ -43,15 +43,15 @@ def decide(
       distances: `[P]` metres of the candidates.
 
     Returns:
-      Brief decisions `[B]`.
+      Brief decisions `[B]`, and the simulator's masks `[B, H, W]`.
     """
     find = functools.partial(_find_candidates, scorer=scorer, rule=rule, distances=distances)
     found = batching.in_small_batches(find, keys, scene, poses, missed)
     motion, usable = _motions(engine, scene, poses, found, max(float(max(distances)), PUSH_STEPS * 0.01))
     found = found.replace(feasible=found.feasible & usable)
     choose = functools.partial(_decide_among, summarize=summarize, rule=rule)
-    decisions: Decision = batching.in_small_batches(choose, scene, poses, found, motion)
-    return decisions
+    label = np.asarray(render.observe(scene, poses).label)
+    return batching.in_small_batches(choose, scene, poses, found, motion), label
 
 
 @functools.partial(jax.jit, static_argnames="scorer")

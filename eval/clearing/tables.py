@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING
 
 from dipn_jax import console, files
 from dipn_jax.errors import UserError
+from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
 if TYPE_CHECKING:
     from dipn_jax.engine import Engine
 
     from .instances import Instance
+
+SHIPPED = ("hard", "heldout")
+"""Case files that come with the package."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,18 +24,26 @@ class Tables:
     """Which tables are cleared."""
 
     cases: str = "hard"
-    """hard (the ten hand-placed instances), random, or a case file of your own."""
+    """hard (ten hand-placed cases), heldout (fifteen, by which nothing is chosen), random, or a case file."""
     names: tuple[str, ...] = ()
     """Only these cases of the file."""
     objects: str = "10"
     """Number of objects (random): 10, 1:7 (uniform), or `paper`."""
     instances: int = 1
-    """Tables (random), or repeats of each case with perturbed physics."""
+    """Tables (random), or repeats of each case, each with other masses and frictions and moved by up to 2 mm."""
+    as_placed: bool = False
+    """Take cases as they are placed, once each: nothing is perturbed."""
+    ranges: Ranges = DEFAULT_RANGES
+    """The ranges that random objects are drawn from."""
 
     def __post_init__(self) -> None:
         console.require_positive(instances=self.instances)
         if self.names and self.cases == "random":
             raise UserError("--names: random tables have none; give --cases hard or a case file")
+        if self.as_placed and (self.cases == "random" or self.instances > 1):
+            raise UserError("--as-placed: for cases, once each; give no --cases random and no --instances")
+        if self.ranges != DEFAULT_RANGES and self.cases != "random":
+            raise UserError("--items, --scale, --density, --friction, --color-noise, --packed: for --cases random only")
 
     def path(self) -> pathlib.Path | None:
         """Return the case file; None for random tables."""
@@ -39,7 +51,9 @@ class Tables:
 
         if self.cases == "random":
             return None
-        return case_files.hard_cases_path() if self.cases == "hard" else files.absolute(self.cases)
+        if self.cases in SHIPPED:
+            return case_files.hard_cases_path() if self.cases == "hard" else case_files.heldout_cases_path()
+        return files.absolute(self.cases)
 
     def slots(self) -> int:
         """Return the largest number of objects on one of the tables."""
@@ -48,7 +62,7 @@ class Tables:
 
         path = self.path()
         if path is None:
-            return scenes.parse_objects(self.objects).slots
+            return scenes.parse_objects(self.objects, ranges=self.ranges).slots
         return int(case_files.load_cases(path)[1].shape.shape[1])
 
     def make(self, engine: Engine, *, seed: int) -> list[Instance]:
@@ -59,10 +73,16 @@ class Tables:
 
         path = self.path()
         if path is None:
-            config = scenes.parse_objects(self.objects)
+            config = scenes.parse_objects(self.objects, ranges=self.ranges)
             return random_instances(engine, config, count=self.instances, seed=seed)
         return hard_instances(
-            engine, path, list(self.names) or None, slots=self.slots(), repeats=self.instances, seed=seed
+            engine,
+            path,
+            list(self.names) or None,
+            slots=self.slots(),
+            repeats=self.instances,
+            seed=seed,
+            perturbed=not self.as_placed,
         )
 
 

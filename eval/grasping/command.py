@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -9,10 +10,11 @@ import tyro
 
 from dipn_jax import console
 from dipn_jax.errors import UserError
-from dipn_jax.names import EngineName
+from dipn_jax.names import ALL_AIDS, Aid, EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
 from .. import options
+from ..clearing.camera import DEFAULT_CAMERA, Camera
 
 
 def grasp(
@@ -23,6 +25,8 @@ def grasp(
     objects: options.Objects = "10",
     seed: int = 1_000_000,
     others: int = 0,
+    aids: tuple[Aid, ...] = ALL_AIDS,
+    camera: Annotated[Camera, tyro.conf.arg(name="")] = DEFAULT_CAMERA,
     engine: EngineName = "auto",
     threads: int | None = None,
     ranges: Ranges = DEFAULT_RANGES,
@@ -42,12 +46,17 @@ def grasp(
       scenes_: number of tables.
       objects: number of objects on a table.
       seed: random seed of scenes and random grasps; keep it away from the training data's.
-      others: where a grasp missed, also try this many of the next best ones, to see what physics allows.
+      others: where a grasp missed, also try this many of the next best ones, to see what physics allows; they are
+        ranked as the policy ranked them, from the same image and with the same memory of misses.
+      aids: what no paper has, as of dipn-eval clear; memory: a grasp that missed is remembered until something near it
+        moves.
+      camera: what GN sees; masks do not matter to it.
       engine: physics engine.
       threads: that native simulates on; one a core if not given.
       ranges: the ranges that random objects are drawn from.
     """
     settings = options.settings(locals())
+    settings |= {f"camera.{name}": value for name, value in dataclasses.asdict(settings.pop("camera")).items()}
     options.check(out, seed, scenes=scenes_)
     console.require_between(0, 1024, others=others)
     if not grasp_net and not curve:
@@ -66,8 +75,18 @@ def grasp(
     partial = resume.Partial(out, settings, inputs=[run] if run else [])
     values: dict[str, Any] = curves.grasp_summary(curves.load_grasp_runs(curve))
     if run:
-        physics, scorer = make_engine(engine, threads=threads), scorers.load_scorer(run)
-        found, tables = success.evaluate(scorer, physics, config, partial, scenes=scenes_, seed=seed, others=others)
+        physics, scorer = make_engine(engine, threads=threads), scorers.load_scorer(run, aids=aids)
+        found, tables = success.evaluate(
+            scorer,
+            physics,
+            config,
+            partial,
+            scenes=scenes_,
+            seed=seed,
+            others=others,
+            camera=camera,
+            remember="memory" in aids,
+        )
         alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
         values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
         lockstep.save(tables, out)

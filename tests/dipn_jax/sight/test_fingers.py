@@ -36,7 +36,7 @@ def test_a_finger_that_would_land_on_something_tall_blocks_the_grasp() -> None:
     model = grasp.GraspNet(grasp.GraspConfig(width=8, coarse=8, blocks=1), rngs=nnx.Rngs(0))
     model.eval()
     images = [jnp.zeros((224, 224, 4)).at[..., 3].set(height) for height in (tall, low)]
-    scores = [np.asarray(nnx.jit(grasp.cautious_scores)(model, image)) for image in images]
+    scores = [np.asarray(nnx.jit(grasp.aided_scores)(model, image)) for image in images]
     for image, cautious in zip(images, scores, strict=True):
         plain = np.asarray(nnx.jit(grasp.score_image)(model, image))
         assert (cautious <= plain + 1e-5).mean() > 0.999

@@ -1,0 +1,102 @@
+"""What `dipn-eval clear` and `sweep` have in common: clear tables and write the results. Imports no JAX at the top."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Any
+
+from dipn_jax import console
+from dipn_jax.errors import UserError
+
+from .. import options
+from .camera import Camera
+from .tables import SHIPPED, Tables
+
+if TYPE_CHECKING:
+    from dipn_jax.engine import Engine
+    from dipn_jax.planning.methods import PolicyConfig
+    from dipn_jax.storage import resume
+
+    from .on_tables import TablePolicy
+
+MAX_CANDIDATES = 4096
+"""Largest number of pushes that may be considered at a time."""
+SIMULATED_PUSH = 0.10
+"""Metres: a shorter push is simulated until one of this length would have ended."""
+
+
+def settings(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of a command by name, those of its tables and camera as `tables.NAME` and `camera.NAME`."""
+    tables: Tables = given["tables"]
+    result: dict[str, Any] = {}
+    for key, value in options.settings(given).items():
+        if isinstance(value, (Tables, Camera)):
+            result |= {f"{key}.{name}": part for name, part in dataclasses.asdict(value).items()}
+        else:
+            result[key] = value
+    return result | ({} if tables.cases in (*SHIPPED, "random") else {"tables.cases": tables.path()})
+
+
+def check(out: pathlib.Path, seed: int, config: PolicyConfig, tables: Tables) -> None:
+    """Raise a UserError for options that make no sense, and a case file that cannot be used."""
+    from dipn_jax.planning.methods import LONGEST_PUSH
+
+    options.check(out, seed, candidates=config.candidates)
+    console.require_between(1, MAX_CANDIDATES, candidates=config.candidates)
+    if not config.distances:
+        raise UserError("--distances: want at least one")
+    for distance in config.distances:
+        console.require_between(0.01, LONGEST_PUSH, distances=distance)
+    if config.candidates < len(config.distances):
+        raise UserError(
+            f"--candidates {config.candidates}: want at least one for each of the {len(config.distances)} distances"
+        )
+    console.require_between(0.0, 10.0, gamma=config.gamma, threshold=config.grasp_above)
+    tables.slots()  # reads the case file
+
+
+def inputs(runs: dict[str, pathlib.Path], tables: Tables) -> list[pathlib.Path]:
+    """Return the runs and files that the results depend on, besides the options."""
+    path = tables.path()
+    return [*runs.values(), *([path] if path else [])]
+
+
+def clear(
+    out: pathlib.Path,
+    decide: TablePolicy,
+    physics: Engine,
+    tables: Tables,
+    *,
+    given: dict[str, Any],
+    runs: dict[str, pathlib.Path],
+    longest: float,
+    remember: bool,
+) -> dict[str, Any]:
+    """Clear tables and write the results; continues where it was interrupted.
+
+    Args:
+      out: folder of the results.
+      decide: decides on every table.
+      physics: physics engine.
+      tables: the tables to clear.
+      given: options, for `settings.json`.
+      runs: networks that `decide` uses.
+      longest: metres of the longest push.
+      remember: whether the scores of grasps like one that missed are halved.
+
+    Returns:
+      The metrics.
+    """
+    from dipn_jax.storage import resume
+
+    from . import lockstep
+
+    seed = given["seed"]
+    partial: resume.Partial = resume.Partial(out, given, inputs=inputs(runs, tables))
+    instances = tables.make(physics, seed=seed)
+    ended = lockstep.clear(instances, physics, decide, partial, seed=seed, longest=longest, remember=remember)
+    lockstep.save(ended, out)
+    values = lockstep.summary(ended)
+    options.finish(out, values, given, partial)
+    return values

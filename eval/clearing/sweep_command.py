@@ -1,0 +1,129 @@
+"""The command `dipn-eval sweep`."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from dipn_jax import console
+from dipn_jax.names import EngineName
+
+from .. import options
+from . import evaluation
+from .camera import DEFAULT_CAMERA, Camera
+from .tables import DEFAULT_TABLES, Tables
+
+if TYPE_CHECKING:
+    from dipn_jax.engine import Engine
+    from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.storage import resume
+
+
+def sweep(
+    out: pathlib.Path,
+    push_net: pathlib.Path,
+    grasp_net: pathlib.Path,
+    distances: str = "0.03:0.12:0.01",
+    tables: Annotated[Tables, tyro.conf.arg(name="")] = DEFAULT_TABLES,
+    camera: Annotated[Camera, tyro.conf.arg(name="")] = DEFAULT_CAMERA,
+    candidates: int = 32,
+    pushes: int = 200,
+    gamma: float = 0.9,
+    threshold: float = 0.7,
+    seed: int = 1_000_000,
+    engine: EngineName = "auto",
+    threads: int | None = None,
+) -> None:
+    """Clear the same tables at one push distance after another, and with the policy that chooses the distance itself.
+
+    Prediction error, completion and efficiency against distance:
+      dipn-eval sweep --push-net builtin --grasp-net builtin --instances 10 --out results/sweep
+
+    Args:
+      out: folder for metrics.json and sweep.png, and in a folder for each distance what dipn-eval clear writes.
+      push_net: run of dipn-train push, or builtin; beyond 10 cm objects continue as in the last centimetre.
+      grasp_net: run of dipn-train grasp, or builtin.
+      distances: first:last:step, metres, to 0.12.
+      tables: the tables to clear.
+      camera: what the policy sees.
+      candidates: pushes considered at a time; the choosing policy gives each of them one of the distances.
+      pushes: scenes of 1 to 7 objects, a push in each, for the prediction error; 0: do not measure it.
+      gamma: discount of a push's value.
+      threshold: grasp at once above this score.
+      seed: random seed of scenes, perturbations and candidates.
+      engine: physics engine.
+      threads: that native simulates on; one a core if not given.
+    """
+    given = evaluation.settings(locals()) | {"method": "dipn+gn", "label": ""}
+    from dipn_jax.physics import make_engine
+    from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.storage import resume
+
+    from .. import metrics
+    from . import sweeping
+
+    every = sweeping.parse(distances)
+    console.require_between(0, 100_000, pushes=pushes)
+    chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold)
+    evaluation.check(out, seed, chosen, tables)
+    configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
+    configs[sweeping.CHOSEN] = chosen
+    networks, physics = Networks(push_net, grasp_net), make_engine(engine, threads=threads)
+    kept = resume.Partial(out, given, inputs=evaluation.inputs(networks.runs("dipn+gn"), tables))
+    values = _clear_with_each(out, configs, networks, physics, tables, camera, given=given, kept=kept)
+    if pushes:
+        values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
+    sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
+    metrics.write(out, values, settings=options.recorded(given, kept))
+    kept.finish()
+    console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
+
+
+def _clear_with_each(
+    out: pathlib.Path,
+    configs: dict[str, PolicyConfig],
+    networks: Networks,
+    physics: Engine,
+    tables: Tables,
+    camera: Camera,
+    *,
+    given: dict[str, Any],
+    kept: resume.Partial,
+) -> dict[str, Any]:
+    """Clear the same tables with each of `configs`, in a folder of its name; continues where it was interrupted.
+
+    Returns:
+      All metrics, as `sweep/NAME/METRIC`.
+    """
+    from . import on_tables
+
+    runs = networks.runs("dipn+gn")
+    longest = max(max(config.distances) for config in configs.values())
+    ended: dict[str, dict[str, Any]] = kept.load({})
+    policies = on_tables.load("dipn+gn", networks, physics, list(configs.values()), camera=camera)
+    for name, decide in zip(configs, policies, strict=True):
+        if name not in ended:
+            named = given | {"label": name}
+            ended[name] = evaluation.clear(
+                out / name, decide, physics, tables, given=named, runs=runs, longest=longest, remember=True
+            )
+            kept.save(ended)
+    return {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
+
+
+def _prediction_errors(
+    push_net: pathlib.Path, physics: Engine, distances: tuple[float, ...], *, scenes: int, seed: int
+) -> dict[str, float]:
+    """Measure the errors of predicted masks at each of `distances`: one push on each of `scenes` as published."""
+    from dipn_jax.planning.predictors import load_predictor
+    from dipn_jax.world.scenes import PAPER
+
+    from . import sweeping
+
+    predictor = load_predictor(push_net)
+    return sweeping.prediction_errors(
+        predictor, physics, PAPER, distances, scenes=scenes, seed=seed, longest=max(distances)
+    )

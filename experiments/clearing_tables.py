@@ -1,0 +1,189 @@
+"""The numbers and tables of docs/clearing.md, from results that are kept table by table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from dipn_jax.eval import metrics
+from dipn_jax.eval.clearing import lockstep, sweeping
+from dipn_jax.eval.report import paper
+
+from dipn_jax.names import ALL_AIDS
+from experiments.kept import Kept, Table
+from experiments.runs import Run
+
+ABLATED = ALL_AIDS
+"""Aids that are left out, and left alone, one after the other."""
+OURS = "dipn+gn"
+"""The method that the others are compared with."""
+MEASURES = (*paper.COLUMNS[:1], "grasps_that_held", "grasp_success_all", "efficiency_all")
+"""Measures of the tables."""
+TITLES = {
+    "completion": "completion",
+    "grasps_that_held": "grasps that held",
+    "grasp_success_all": "objects a grasp",
+    "efficiency_all": "objects an action",
+}
+"""Titles of the measures."""
+
+
+def numbers(listed: Sequence[Run], kept: Kept) -> dict[str, Any]:
+    """Return all numbers of the page by name; those of runs that are not kept are not there.
+
+    Of several trainings of one method there are the mean, `_spread` (the largest less the smallest), and the interval
+    over cases, then over repeats and trainings; `_less` is the difference from DIPN+GN on the same tables.
+    """
+    groups: dict[str, list[list[Table]]] = {}
+    for run in listed:
+        tables = kept.tables(run)
+        if tables is not None:
+            groups.setdefault(_group(run.name), []).append(tables)
+    values: dict[str, Any] = {}
+    for name, trainings in groups.items():
+        values |= {f"{name}/{key}": value for key, value in _measured(trainings).items()}
+        ours = groups.get(_rival(name))
+        if ours and ours is not trainings:
+            values |= {f"{name}/{key}": value for key, value in _compared(trainings, ours).items()}
+    return values
+
+
+def _group(name: str) -> str:
+    """Return the name of a run without the number of its training."""
+    return name.rpartition("/")[0] if name.startswith("table/") else name
+
+
+def _rival(name: str) -> str:
+    """Return the group that a group is compared with: DIPN+GN on the same tables, as it is shipped."""
+    if name.startswith("table/"):
+        return f"{name.rpartition('/')[0]}/{OURS}"
+    if name.startswith("masks/"):
+        return f"table/{name.split('/')[1]}/shipped/all/{OURS}"
+    if name.startswith("changed/"):
+        return f"{name.rpartition('/')[0]}/{OURS}"
+    return f"table/heldout/shipped/all/{OURS}"
+
+
+def _measured(trainings: list[list[Table]]) -> dict[str, Any]:
+    every = [table for tables in trainings for table in tables]
+    values: dict[str, Any] = {"tables": len(every), "trainings": len(trainings)}
+    values["grasps"], values["pushes"] = (sum(getattr(one, kind) for one in every) for kind in ("grasps", "pushes"))
+    cases = [table.name for table in every]
+    each = [lockstep.counts(tables) for tables in trainings]
+    for key, (hits, trials) in lockstep.counts(every).items():
+        value, low, high = metrics.ratio_interval(hits, trials, groups=cases)
+        values |= {key: value, f"{key}_low": low, f"{key}_high": high}
+        ratios = [one[key][0].sum() / max(one[key][1].sum(), 1) for one in each]
+        values[f"{key}_spread"] = float(np.ptp(ratios))
+    for reason in ("pushed out", "out of actions", "fault"):
+        values[f"ended_{reason.replace(' ', '_')}"] = sum(table.ended == reason for table in every)
+    return {
+        key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in values.items()
+    }
+
+
+def _compared(theirs: list[list[Table]], ours: list[list[Table]]) -> dict[str, Any]:
+    """Return differences from DIPN+GN, paired by training and table."""
+    pairs = [pair for one, other in zip(theirs, ours, strict=False) for pair in zip(one, other, strict=False)]
+    if any(a.name != b.name for a, b in pairs):
+        raise ValueError("tables of other cases, or in another order, cannot be compared")
+    cases = [a.name for a, _ in pairs]
+    sides = [lockstep.counts([pair[i] for pair in pairs]) for i in range(2)]
+    values: dict[str, Any] = {}
+    for key in MEASURES:
+        value, low, high = metrics.ratio_difference(sides[0][key], sides[1][key], cases)
+        values |= {f"{key}_less": value, f"{key}_less_low": low, f"{key}_less_high": high}
+    return values
+
+
+def _cell(values: dict[str, Any], at: str, *, spread: bool = False) -> str:
+    if values.get(at) is None:
+        return "-"
+    value, low, high = (100 * values[f"{at}{end}"] for end in ("", "_low", "_high"))
+    trainings = f" ({100 * values[f'{at}_spread']:.1f})" if spread else ""
+    return f"{value:.1f} [{low:.0f}, {high:.0f}]{trainings}"
+
+
+def _difference(values: dict[str, Any], at: str) -> str:
+    if values.get(f"{at}_less") is None:
+        return ""
+    value, low, high = (100 * values[f"{at}_less{end}"] for end in ("", "_low", "_high"))
+    sure = "**" if low > 0 or high < 0 else ""
+    return f"{sure}{value:+.1f}{sure} [{low:+.1f}, {high:+.1f}]"
+
+
+def _table(values: dict[str, Any], head: str, rows: dict[str, str], *, spread: bool = False) -> str:
+    """Return a table of the groups `rows`, title by name, as far as they are there."""
+    lines = [f"| {head} | tables | pushes | " + " | ".join(TITLES.values()) + " | efficiency, difference |"]
+    lines.append("| --- " * (len(TITLES) + 4) + "|")
+    for at, title in rows.items():
+        if f"{at}/tables" in values:
+            cells = [str(values[f"{at}/tables"]), str(values[f"{at}/pushes"])]
+            cells += [_cell(values, f"{at}/{key}", spread=spread) for key in TITLES]
+            lines.append(f"| {title} | {' | '.join(cells)} | {_difference(values, f'{at}/efficiency_all')} |")
+    return "\n".join(lines) + "\n"
+
+
+KINDS = ("heldout", "hard", "random-10", "random-30")
+"""Kinds of tables, in the order of the page."""
+METHODS = ("dipn+gn", "gn", "dqn+gn", "rea+dipn", "vpg", "physics+gn")
+"""Methods in the order of the tables."""
+
+
+def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
+    """Return a table of all methods on one kind of tables, in per cent, with the paper's numbers for the same."""
+    rows = {
+        f"table/{on}/{budget}/{aids}/{method}": f"{method}, {budget}"
+        for budget in ("shipped", "large", "paper")
+        for method in METHODS
+    }
+    text = _table(values, f"{on}, {'all aids' if aids == 'all' else 'bare'}", rows, spread=True)
+    for method, published in paper.TABLE.get(on, {}).items() if aids == "bare" else ():
+        found = dict(zip(paper.COLUMNS, published, strict=True))
+        cells = [f"{found[key]:.1f}" if key in found else "" for key in TITLES]
+        text += f"| *{method}, the paper* | | | {' | '.join(cells)} | |\n"
+    return text
+
+
+def all_tables(values: dict[str, Any]) -> list[str]:
+    """Return all tables of the page but the one of the sweep."""
+    tables = [of_methods(values, on, aids) for on in KINDS for aids in ("all", "bare")]
+    shipped = "table/{}/shipped/all/dipn+gn"
+    masks = {}
+    for on in KINDS:
+        masks[shipped.format(on)] = f"{on}, masks found in the image"
+        masks[f"masks/{on}/true"] = f"{on}, the simulator's masks"
+    noise = {shipped.format("heldout"): "no noise"} | _named(values, "noise")
+    aids = {shipped.format("heldout"): "all aids", "table/heldout/shipped/bare/dipn+gn": "none"}
+    for aid in ABLATED:
+        aids |= {f"aids/without/{aid}": f"all but `{aid}`", f"aids/alone/{aid}": f"`{aid}` alone"}
+    distance = {shipped.format("heldout"): "10 cm", "distance/chosen": "3 to 12 cm, chosen"}
+    return [
+        *tables,
+        _table(values, "masks", masks),
+        _table(values, "noise, heldout", noise),
+        _table(values, "aids, heldout", aids),
+        _table(values, "changed worlds", _named(values, "changed")),
+        _table(values, "distance, heldout", distance),
+    ]
+
+
+def _named(values: dict[str, Any], kind: str) -> dict[str, str]:
+    """Return the groups of a kind, title by name."""
+    found = [key.rpartition("/")[0] for key in values if key.startswith(f"{kind}/") and key.endswith("/tables")]
+    return {group: ", ".join(group.split("/")[1:]) for group in found}
+
+
+def swept(values: dict[str, Any]) -> str:
+    """Return a table of what `dipn-eval sweep` found at each distance; errors are true 1-IoU of moved objects."""
+    lines = ["| push | error, moved objects | completion | grasp success | efficiency | pushes |", "| --- " * 6 + "|"]
+    for each in sweeping.names(values):
+        at = f"sweep/{each}"
+        error = values.get(f"{at}/push_error/moved")
+        name = each if error is None else f"{100 * float(each):.0f} cm"
+        cells = [_cell(values, f"{at}/{key}") for key in sweeping.SHOWN]
+        lines.append(
+            f"| {name} | {'-' if error is None else f'{error:.3f}'} | {' | '.join(cells)} | {values[f'{at}/pushes']} |"
+        )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,124 @@
+"""How a table ends, by simulations whose results are given."""
+
+import dataclasses
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from dipn_jax.eval.clearing import lockstep
+from dipn_jax.eval.clearing.instances import Instance
+
+from dipn_jax.planning import planner
+from dipn_jax.storage.resume import Partial
+from dipn_jax.structs import Decision, Fault, Grasp, Push, Scene
+from dipn_jax.workspace import WORKSPACE
+from dipn_jax.world import scenes
+
+OBJECTS = 2
+
+
+@dataclasses.dataclass
+class Script:
+    """A policy and an engine: what is done at each action, and how it ends."""
+
+    steps: list[tuple[str, Any]]
+    done: int = 0
+
+    def decide(self, keys: jax.Array, scene: Scene, poses: np.ndarray, missed: np.ndarray) -> Any:
+        """Push or grasp as the script says."""
+        zero = np.zeros(1, np.float32)
+        decision = Decision(
+            is_push=np.array([self.steps[self.done][0] == "push"]),
+            push=Push(np.zeros((1, 2), np.float32), zero, zero),
+            grasp=Grasp(np.zeros((1, 2), np.float32), zero, zero),
+            grasp_pixel=np.zeros((1, 3), np.int32),
+            grasp_score=zero,
+            value_now=zero,
+            value_push=zero,
+            motion=np.zeros((1, OBJECTS, 3), np.float32),
+        )
+        return decision, np.full((1, 224, 224), -1, np.int8)
+
+    def push(self, engine: Any, scene: Scene, poses: np.ndarray, push: Push, *, longest: float) -> Any:
+        """Move the first object to where the script says, or fail."""
+        what = self._next()
+        after = poses.copy()
+        if not isinstance(what, Fault):
+            after[0, 0, 0] = what
+        fault = np.array([what if isinstance(what, Fault) else 0])
+        return type("Rollout", (), {"poses": after[:, None], "fault": fault})
+
+    def grasp_away(self, engine: Any, scene: Scene, poses: np.ndarray, grasp: Grasp) -> Any:
+        """Hold the objects that the script names, or fail."""
+        what = self._next()
+        held = np.zeros((1, OBJECTS), bool)
+        if not isinstance(what, Fault):
+            held[0, list(what)] = True
+        scene, after = jax.device_get(scenes.remove(scene, poses, held))
+        return scene, after, held, np.array([what if isinstance(what, Fault) else 0])
+
+    def _next(self) -> Any:
+        self.done += 1
+        return self.steps[self.done - 1][1]
+
+
+def _play(steps: list[tuple[str, Any]], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Instance:
+    script = Script(steps)
+    monkeypatch.setattr(lockstep.primitives, "push", script.push)
+    monkeypatch.setattr(lockstep.clutter, "grasp_away", script.grasp_away)
+    shape, ones = np.zeros(OBJECTS, np.int32), np.ones(OBJECTS, np.float32)
+    scene = Scene(shape, np.full((OBJECTS, 3), 0.05, np.float32), np.ones((OBJECTS, 3), np.float32), ones, ones)
+    poses = np.array([[0, 0, 0.025, 1, 0, 0, 0], [0.1, 0, 0.025, 1, 0, 0, 0]], np.float32)
+    table = Instance("one", scene, poses, OBJECTS)
+    partial = Partial(tmp_path, {})
+    (ended,) = lockstep.clear([table], None, script.decide, partial, seed=0)  # type: ignore[arg-type]
+    partial.finish()
+    assert script.done == ended.actions == len(ended.film)
+    return ended
+
+
+def test_an_object_pushed_out_by_the_third_action_ends_the_table(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = [("grasp", ()), ("push", 0.05), ("push", WORKSPACE.half + 0.001), ("grasp", (0, 1))]
+    ended = _play(steps, tmp_path, monkeypatch)
+    assert (ended.ended, ended.pushes, ended.grasps, ended.removed) == ("pushed out", 2, 1, 0)
+    values = lockstep.summary([ended])
+    assert values["ended_pushed_out"] == 1 and values["completion"] == 0 and values["pushes"] == 2
+    assert _play([("push", WORKSPACE.half - 0.001), ("grasp", (0, 1))], tmp_path, monkeypatch).ended == "cleared"
+
+
+@pytest.mark.parametrize("action", ["push", "grasp"])
+def test_a_simulation_that_went_wrong_ends_the_table(
+    action: str, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[tuple[str, Any]] = [("grasp", (0,)), (action, Fault.NON_FINITE), ("grasp", (1,))]
+    ended = _play(steps, tmp_path, monkeypatch)
+    assert (ended.ended, ended.actions, ended.removed) == ("fault", 2, 1)
+    values = lockstep.summary([ended])
+    assert values["ended_fault"] == 1 and values["completion"] == 0 and values["efficiency_all"] == 1 / 2
+
+
+def test_a_table_is_cleared_when_nothing_is_left(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = _play([("grasp", (0,)), ("push", 0.0), ("grasp", ()), ("grasp", (1,))], tmp_path, monkeypatch)
+    assert (ended.ended, ended.removed, ended.held, ended.grasps, ended.pushes) == ("cleared", 2, 2, 3, 1)
+    both = _play([("grasp", (0, 1))], tmp_path, monkeypatch)
+    values = lockstep.summary([both])
+    assert both.held == 1 and values["grasp_success_all"] == 2 and values["grasps_that_held"] == 1
+
+
+def test_a_table_ends_after_three_actions_an_object(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = _play([("grasp", ())] * 3 + [("push", 0.0)] * 4, tmp_path, monkeypatch)
+    assert (ended.ended, ended.actions) == ("out of actions", 3 * OBJECTS)
+    last = _play([("grasp", ())] * 5 + [("grasp", (0, 1))], tmp_path, monkeypatch)
+    assert last.ended == "cleared", "the last action counts"
+
+
+def test_the_policy_is_told_of_misses_only_where_it_remembers(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = _play([("grasp", ()), ("grasp", (0, 1))], tmp_path, monkeypatch)
+    np.testing.assert_array_equal(ended.film[0]["missed"][0], planner.NONE_MISSED[0])
+    np.testing.assert_array_equal(ended.film[1]["missed"][0], [0, 0, 0])

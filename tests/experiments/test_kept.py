@@ -1,0 +1,108 @@
+"""Results that are kept table by table, and the tables that are made of them."""
+
+import pathlib
+from typing import Any
+
+import pytest
+from dipn_jax.eval import metrics
+
+from dipn_jax import files
+from experiments import clearing_tables, kept, runs
+from experiments.kept import Kept
+from experiments.runs import Recipe, Run
+
+ENTRY = {"name": "01", "ended": "cleared", "objects": 5, "removed": 5, "held": 4, "grasps": 5, "pushes": 1}
+"""What `episodes.json` says of a table."""
+
+
+def _run(folder: pathlib.Path, name: str, entries: list[dict[str, Any]]) -> Run:
+    """Return a run that has ended."""
+    run = Run(name, folder / name, ("dipn-eval", "clear", "--out", str(folder / name)))
+    files.write_json(run.out / "episodes.json", entries)
+    runs.write_stamp(run, "key", complete=True)
+    return run
+
+
+def test_what_is_kept_is_what_was_found(tmp_path: pathlib.Path) -> None:
+    lost = ENTRY | {"name": "02", "ended": "pushed out", "removed": 1, "held": 1, "grasps": 2, "pushes": 3}
+    run = _run(tmp_path, "a", [ENTRY, lost, ENTRY])
+    results = Kept(tmp_path / "kept.json")
+    results.keep(run, "key")
+    again = Kept(tmp_path / "kept.json")
+    assert again.has(run, "key") and not again.has(run, "other")
+    tables = again.tables(run)
+    assert tables is not None and [table.name for table in tables] == ["01", "02", "01"]
+    assert tables[1] == kept.Table("02", "pushed out", 5, 1, 1, 2, 3)
+    assert again.made([run])["a"]["made_by"][-1]["cores"] >= 1
+    assert Kept(tmp_path / "none.json").tables(run) is None
+
+
+def test_only_what_is_missing_is_carried_out_and_what_that_needs(tmp_path: pathlib.Path) -> None:
+    recipe = Recipe(tmp_path)
+    network = recipe("net", "dipn-train push --data x")
+    recipe("one", "dipn-eval clear --push-net", network)
+    recipe("two", "dipn-eval clear --push-net", network, "--seed 2")
+    recipe("three", "dipn-eval clear")
+    listed, found = recipe.runs, runs.keys(recipe.runs)
+    results = Kept(tmp_path / "kept.json")
+
+    def left(*only: str) -> list[str]:
+        return [run.name for run in kept.missing(listed, only, found, results)]
+
+    assert left() == ["net", "one", "two", "three"]
+    results.found |= {name: {"key": found[name]} for name in ("one", "three")}
+    assert left() == ["net", "two"] and left("one") == [] and left("net") == ["net"]
+    results.found["two"] = {"key": "of another command"}
+    assert left() == ["net", "two"]
+    results.found["two"] = {"key": found["two"]}
+    assert left() == []
+
+
+def _kept(tmp_path: pathlib.Path, rows: dict[str, list[int]]) -> tuple[list[Run], Kept]:
+    """Return runs that cleared tables of two cases, each with the numbers of grasps given."""
+    results, listed = Kept(tmp_path / "kept.json"), []
+    for name, grasps in rows.items():
+        entries = [ENTRY | {"name": f"0{i // 2}", "grasps": count, "pushes": 0} for i, count in enumerate(grasps)]
+        listed.append(_run(tmp_path, name, entries))
+        results.keep(listed[-1], "key")
+    return listed, results
+
+
+def test_numbers_of_several_trainings_and_differences(tmp_path: pathlib.Path) -> None:
+    rows = {
+        "table/hard/paper/all/dipn+gn/0": [5, 5, 10, 10],
+        "table/hard/paper/all/dipn+gn/1": [5, 5, 5, 5],
+        "table/hard/paper/all/gn/0": [10, 10, 20, 20],
+        "table/hard/paper/all/gn/1": [10, 10, 10, 10],
+    }
+    values = clearing_tables.numbers(*_kept(tmp_path, rows))
+    at = "table/hard/paper/all/dipn+gn"
+    assert values[f"{at}/tables"] == 8 and values[f"{at}/trainings"] == 2 and values[f"{at}/grasps"] == 50
+    assert values[f"{at}/efficiency_all"] == 40 / 50
+    assert values[f"{at}/efficiency_all_spread"] == pytest.approx(20 / 20 - 20 / 30)
+    hits, trials = [5] * 8, [5, 5, 10, 10, 5, 5, 5, 5]
+    want = metrics.ratio_interval(hits, trials, groups=["a", "a", "b", "b"] * 2)
+    assert (values[f"{at}/efficiency_all_low"], values[f"{at}/efficiency_all_high"]) == want[1:]
+    other = "table/hard/paper/all/gn"
+    assert values[f"{other}/efficiency_all_less"] == pytest.approx(40 / 100 - 40 / 50)
+    assert values[f"{other}/efficiency_all_less_high"] < 0 and f"{at}/efficiency_all_less" not in values
+    text = clearing_tables.of_methods(values, "hard", "all")
+    assert "| dipn+gn, paper | 8 | 0 | 100.0 [100, 100] (0.0) |" in text and "| **-40.0** [" in text
+
+
+def test_a_difference_that_may_be_nothing_is_not_bold(tmp_path: pathlib.Path) -> None:
+    rows = {"table/hard/paper/all/dipn+gn/0": [5, 9, 5, 9], "table/hard/paper/all/gn/0": [9, 5, 9, 5]}
+    text = clearing_tables.of_methods(clearing_tables.numbers(*_kept(tmp_path, rows)), "hard", "all")
+    assert "+0.0 [" in text and "**" not in text
+
+
+def test_every_group_is_compared_with_dipn_gn_on_its_own_tables() -> None:
+    rivals = {
+        "table/hard/paper/bare/vpg": "table/hard/paper/bare/dipn+gn",
+        "masks/random-10/true": "table/random-10/shipped/all/dipn+gn",
+        "changed/heavy/gn": "changed/heavy/dipn+gn",
+        "noise/holes": "table/heldout/shipped/all/dipn+gn",
+        "aids/alone/table": "table/heldout/shipped/all/dipn+gn",
+    }
+    for name, rival in rivals.items():
+        assert clearing_tables._rival(name) == rival
