@@ -13,12 +13,12 @@ from dipn_jax.eval.clearing import instances, lockstep, on_tables
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.grasping import success
 
-from dipn_jax import geometry
+from dipn_jax import geometry, structs
 from dipn_jax.planning import scorers
 from dipn_jax.storage.resume import Partial
-from dipn_jax.structs import ABSENT, Array, Fault, Rollout, Scene, Trajectory
+from dipn_jax.structs import ABSENT, Array, Fault, Grasp, Rollout, Scene, SettledScene, Trajectory
 from dipn_jax.workspace import GRIPPER
-from dipn_jax.world import scenes
+from dipn_jax.world import clutter, scenes
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 PEAKS = {"first": (60, 60), "second": (60, 150), "third": (150, 60), "none": (150, 150)}
@@ -95,6 +95,27 @@ def test_a_random_grasp_that_went_wrong_does_not_count() -> None:
     found = success._random_foreground(peaks, Lifts(reach=1), tables, 0)  # type: ignore[arg-type]
     assert found["grasp_success/random_foreground"] == pytest.approx(1 / 2)
     assert found["random/reliability/0/count"] == 2 and found["random/expected_calibration_error"] == pytest.approx(0.5)
+
+
+def test_labels_are_held_against_the_grasps_that_went_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    # two grasps a table: labels, mass, friction, and how far the second is off the object
+    rows = [((1, 0), 0.1, 0.5, 1.0), ((1, 1), 0.1, 0.5, 1.0), ((1, 0), HEAVY, 0.5, 0.0), ((0, 1), 0.1, 0.5, 0.0)]
+    rows.append(((1, 1), HEAVY, FAULTY, 0.0))
+    tables = [_table([], "none", mass=mass, friction=friction) for _, mass, friction, _ in rows]
+    scene = structs.stack([table.scene.replace(shape=np.zeros(1, np.int32)) for table in tables])
+    items = SettledScene(scene, np.stack([table.poses - 1 for table in tables]), np.zeros(5, np.int32))
+    labels = np.resize(np.array([row[0] for row in rows], np.float32), (16, 2))
+    off = np.resize(np.array([[0, row[3]] for row in rows], np.float32), (16, 2))
+
+    def labelled(keys: Array, scene: Scene, poses: Array, *, count: int) -> tuple[Grasp, Array]:
+        centers = np.asarray(poses)[:, 0, None, :2] + off[..., None]
+        return Grasp(centers, np.zeros((16, count), np.float32), np.zeros((16, count), np.float32)), labels
+
+    monkeypatch.setattr(success, "_labelled", labelled)
+    monkeypatch.setattr(clutter, "settled_scenes", lambda *_: items)
+    found = success.label_agreement(Lifts(), CONFIG, scenes=5, seed=0, each=2)  # type: ignore[arg-type]
+    wanted = {"grasps": 8, "agree": 5 / 8, "positive_holds": 3 / 5, "negative_fails": 2 / 3, "positive": 5 / 8}
+    assert found == pytest.approx(wanted)
 
 
 def test_the_rates_are_of_all_grasps_and_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from dipn_jax import structs
 from dipn_jax.sight import segment
 from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import ABSENT, Array, Fault, Rollout, Scene, SettledScene, Trajectory
-from dipn_jax.world import clutter, scenes
+from dipn_jax.world import clutter, scenes, shapes
 
 CONFIG = scenes.fixed_count(5)
 SLIDE = np.array([0.01, 0.02], np.float32)
@@ -63,7 +63,8 @@ def test_the_floor_guesses_mass_and_friction(items: SettledScene) -> None:
     for k, centimetres in enumerate(pushes.DISTANCES):
         true = centimetres * SLIDE * np.stack([scene.friction, scene.mass], -1)
         np.testing.assert_allclose((executed.truth[:, 1 + k] - before)[..., :2], true, atol=1e-6)
-        guess = centimetres * SLIDE * np.stack([np.full(scene.mass.shape, 0.35), scenes.nominal(scene).mass], -1)
+        mass = 500 * shapes.volume(scene.shape, scene.size)
+        guess = centimetres * SLIDE * np.stack([np.full(mass.shape, 0.35), mass], -1)
         np.testing.assert_allclose((executed.rolled[:, k] - before)[..., :2], guess, atol=1e-6)
     rows: push_errors.Rows = {}
     push_errors.measure(rows, executed, {}, executed.seen())
