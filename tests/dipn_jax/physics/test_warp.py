@@ -23,7 +23,6 @@ def test_without_its_packages_it_is_refused_in_one_line(monkeypatch: pytest.Monk
 
 @pytest.fixture(scope="module")
 def warp_engine() -> Any:
-    pytest.importorskip("warp")
     return physics.make_engine("warp")
 
 
