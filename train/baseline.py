@@ -17,12 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import files, structs
+from dipn_jax import files, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
+from dipn_jax.seeds import Purpose
 from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
@@ -137,7 +138,8 @@ def _play(
     weights, statistics = jax.device_get((params, rest))
 
     def fresh() -> State:
-        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
+        purpose = Purpose.BASELINE_TABLES
+        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed, purpose=purpose)
         return State(weights, statistics, jax.device_get(optimizer.init(weights)), begun)
 
     def act(state: State) -> str:
@@ -160,7 +162,8 @@ def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, score
 def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneConfig, config: BaselineConfig) -> None:
     """Act once on every table; keep what happened and what it teaches."""
     count, before = config.tables, state.tables
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.round), (2, count))
+    key = jax.random.fold_in(seeds.key(config.seed, Purpose.BASELINE_TRAINING), 2**20 + state.round)
+    keys = jax.random.split(key, (2, count))
     anew = np.ones(count, bool) if state.then is None else state.anew
     now: Look = jax.device_get(look(keys[0], before.scene, before.poses, anew))
     if state.then is not None:
@@ -204,7 +207,7 @@ def _update(state: State, step: Callable[..., Any], config: BaselineConfig) -> t
         return state.params, state.rest, state.moments
     seen = {name: structs.concatenate(state.seen[name]) for name in parts}
     rng = np.random.default_rng([config.seed, state.round, 1])
-    key = jax.random.fold_in(jax.random.key(config.seed + 1), state.round)
+    key = jax.random.fold_in(seeds.key(config.seed, Purpose.BASELINE_TRAINING), state.round)
     params, rest, moments = jax.tree.map(jnp.array, (state.params, state.rest, state.moments))
     drawn = [
         {n: rng.integers(len(some.target), size=config.batch) for n, some in seen.items()}

@@ -16,7 +16,7 @@ import optax
 import tensorboardX
 from flax import nnx
 
-from dipn_jax import console, files
+from dipn_jax import console, files, seeds
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner
@@ -137,7 +137,7 @@ def _fit(
     order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
     step_fn = make_step(task, graph, optimizer)
     log = _Log(out, begin)
-    key = jax.random.key(config.seed)
+    key = seeds.key(config.seed, seeds.Purpose.TRAINING)
     latest: dict[str, float] = {}
     watch = finite.Watch(config.learning_rate, lambda k: np.asarray(order[k]), "the last finite checkpoint is kept")
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import console, files, geometry, structs
+from dipn_jax import console, files, geometry, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.planning import planner
 from dipn_jax.storage import resume
@@ -62,7 +62,8 @@ def clear(
     """
     total = sum(instance.objects for instance in instances)
     instances = partial.load(instances)
-    keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(instances))]
+    key = seeds.key(seed, seeds.Purpose.CLEARING_CANDIDATES)
+    keys = [jax.random.fold_in(key, number) for number in range(len(instances))]
     with console.Progress("clear", total, unit="objects", done=sum(i.removed for i in instances)) as progress:
         while active := [number for number, instance in enumerate(instances) if not instance.ended]:
             rows = [instances[number] for number in active]

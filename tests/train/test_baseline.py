@@ -13,6 +13,7 @@ from dipn_jax.train.acting import Look
 from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.planning import scorers
+from dipn_jax.seeds import Purpose
 from dipn_jax.storage import checkpoint, resume
 from dipn_jax.structs import Grasp, Push
 from dipn_jax.world import scenes
@@ -59,7 +60,7 @@ def test_a_target_has_the_value_of_the_best_next_action_but_no_impossible_one() 
 
 
 def test_finished_tables_are_set_anew(engine: Any) -> None:
-    played = tables.begin(engine, CONFIG, count=4, seed=0)
+    played = tables.begin(engine, CONFIG, count=4, seed=0, purpose=Purpose.BASELINE_TABLES)
     scene, poses = jax.tree.map(np.array, played.scene), played.poses.copy()
     scene.shape[0] = -1  # cleared
     poses[1, 0, 0] = 0.3  # spilt
@@ -135,7 +136,7 @@ def test_the_published_form_takes_a_training_step(engine: Any) -> None:
 
     model = checkpoint.build("vpg", VpgConfig("paper", blocks=(1, 1, 1, 1)))
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    played = tables.begin(engine, CONFIG, count=2, seed=1)
+    played = tables.begin(engine, CONFIG, count=2, seed=1, purpose=Purpose.BASELINE_TABLES)
     look = functools.partial(acting.look, graph, scorer=None, distance=0.1)
     keys = jax.random.split(jax.random.key(0), 2)
     seen = jax.eval_shape(look, params, rest, keys, played.scene, played.poses, np.ones(2, bool))
@@ -161,7 +162,7 @@ def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
     from dipn_jax.networks.vpg import VpgConfig
     from dipn_jax.structs import GraspEpisode
 
-    played = tables.begin(engine, CONFIG, count=2, seed=1)
+    played = tables.begin(engine, CONFIG, count=2, seed=1, purpose=Purpose.BASELINE_TABLES)
     center = played.poses[:, 0, :2]
     aim = Grasp(np.stack([center[0], center[0] + [0.0, 0.06]]), np.zeros(2), np.zeros(2))
     first = structs.take(played.scene, np.zeros(2, int)), played.poses[np.zeros(2, int)]
