@@ -71,7 +71,7 @@ class BaselineConfig:
     """Pushes and grasps in all."""
     tables: int = 10
     """Tables that are acted on side by side."""
-    updates: int = 10
+    updates: int = 20
     """Optimizer steps after each round of one action on every table."""
     batch: int = 32
     """Outcomes in a step, of pushes and of grasps each."""
