@@ -12,10 +12,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import batching, console, files
+from dipn_jax import batching, console, files, seeds
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
+from dipn_jax.seeds import Purpose
 from dipn_jax.structs import Fault
 from dipn_jax.world import shapes
 
@@ -79,7 +80,7 @@ def _sections(
 ) -> dict[str, Callable[[], dict[str, float]]]:
     """Return the functions that measure each section, by name."""
     native = make_engine("native", threads=threads)
-    keys = jax.random.split(jax.random.key(config.seed), 3)
+    keys = jax.random.split(seeds.key(config.seed, Purpose.WORLD_CHECK), 3)
 
     @functools.cache
     def reference() -> tuple[world.Trial, dict[str, float], np.ndarray, np.ndarray]:

@@ -16,18 +16,21 @@ from typing import Any
 
 import jax
 
-from dipn_jax import console, files, structs
+from dipn_jax import console, files, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine, resolve
 from dipn_jax.planning.planner import Scorer
+from dipn_jax.seeds import Purpose
 from dipn_jax.storage import records, shards
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 
 from . import episodes
 
+PURPOSES = {"push": Purpose.PUSH_DATA, "grasp": Purpose.GRASP_DATA, "images": Purpose.IMAGE_DATA}
+"""The purpose of the random numbers of each kind of data."""
 MAX_ATTEMPTS = 100
 """Batches without a single usable episode after which a shard is given up."""
 MAX_ACTIONS = 256
@@ -113,7 +116,7 @@ def shard(
 ) -> tuple[Any, dict[str, int]]:
     """Return the episodes of one shard and the counts of the batches that they are from."""
     want = job.size(index)
-    key = jax.random.fold_in(jax.random.key(job.seed), index)
+    key = jax.random.fold_in(seeds.key(job.seed, PURPOSES[job.kind]), index)
     make = _maker(job, scorer)
     each = job.actions * (len(job.distances) if job.kind == "push" else 1)
     done: list[Any] = []

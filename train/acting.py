@@ -22,11 +22,11 @@ from dipn_jax.structs import Array, Fault, Grasp, Push, Pytree, Scene
 from dipn_jax.world import clutter, primitives
 
 EXPLORED_AT_FIRST = 0.5
-"""Share of actions that are random at the beginning. Source: VPG's released code."""
+"""Share of actions whose primitive is random at the beginning. Source: VPG's released code."""
 EXPLORED_AT_LEAST = 0.1
-"""Share of actions that stay random. Source: VPG's released code."""
+"""Share of actions whose primitive stays random. Source: VPG's released code."""
 EXPLORATION_DECAY = 0.9998
-"""Factor of the share of random actions, for every action. Source: VPG's released code."""
+"""Factor of that share, for every action. Source: VPG's released code."""
 CHANGED_HEIGHT = 0.01
 """Metres by which a pixel's height has to change to be counted; also the height above which it shows an object."""
 CHANGED_PIXELS = 300
@@ -56,11 +56,8 @@ class Look(Pytree):
     height: Array  # [H, W] metres
     push: Push  # the best one
     push_value: Array  # [] -inf if no push can be begun
-    random_push: Push
-    can_push: Array  # [] bool: the random push can be begun
     grasp: Grasp  # the best one
     grasp_value: Array  # []
-    random_grasp: Grasp
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("scorer", "distance"))
@@ -68,7 +65,6 @@ def look(
     graph: Any,
     params: Any,
     rest: Any,
-    keys: jax.Array,
     scene: Scene,
     poses: jax.Array,
     wanted: jax.Array,
@@ -76,44 +72,39 @@ def look(
     scorer: Scorer | None,
     distance: float,
 ) -> Look:
-    """Look at the tables `[T]` that are `wanted [T]`, and find the best and random actions; zeros for the others."""
+    """Look at the tables `[T]` that are `wanted [T]`, and find the best actions; zeros for the others."""
     network: VPG = nnx.merge(graph, params, rest)
     network.eval()
     pushes, grasps = scorers.value_scorers(network)
     grasps = scorer or grasps
 
-    def one(args: tuple[jax.Array, Scene, jax.Array]) -> Look:
-        push_key, grasp_key = jax.random.split(args[0])
-        seen = render.render(*args[1:])
+    def one(args: tuple[Scene, jax.Array]) -> Look:
+        seen = render.render(*args)
         image = render.rgbd(seen)[None]
         possible = fingers.pushable(seen.height)
         values = pushes(image)[0] if pushes else jnp.zeros(possible.shape)
         push_index, push_value = candidates.best_grasp(jnp.where(possible, values, -jnp.inf))
-        sampled, feasible = candidates.sample_pushes(push_key, seen, count=1, distance=distance)
-        where = candidates.push_index(jax.tree.map(lambda leaf: leaf[0], sampled))
         assert grasps is not None
         grasp_index, grasp_value = candidates.best_grasp(grasps(image)[0])
-        anywhere = candidates.random_grasps(grasp_key, seen, count=1)
         return Look(
             height=seen.height,
             push=candidates.push_at(push_index, distance),
             push_value=push_value,
-            random_push=candidates.push_at(where, distance),
-            can_push=feasible[0],
             grasp=candidates.grasp_at(grasp_index, seen.height),
             grasp_value=grasp_value,
-            random_grasp=jax.tree.map(lambda leaf: leaf[0], anywhere),
         )
 
-    def some(args: tuple[jax.Array, Scene, jax.Array, jax.Array]) -> Look:
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, args[:3]))
-        return jax.lax.cond(args[3], lambda: one(args[:3]), lambda: nothing)
+    def some(args: tuple[Scene, jax.Array, jax.Array]) -> Look:
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, args[:2]))
+        return jax.lax.cond(args[2], lambda: one(args[:2]), lambda: nothing)
 
-    return jax.lax.map(some, (keys, scene, poses, wanted))
+    return jax.lax.map(some, (scene, poses, wanted))
 
 
-def explore(now: Look, rng: np.random.Generator, actions: int, *, may_push: bool) -> tuple[np.ndarray, Push, Grasp]:
-    """Choose the best action on each table, or now and then a random one, so that the learner explores.
+def choose(now: Look, rng: np.random.Generator, actions: int, *, may_push: bool) -> np.ndarray:
+    """Choose between the best push and the best grasp on each table: the higher value, or now and then either.
+
+    So the released codes of VPG and of DIPN (for DQN+GN) explore; a learner of grasps alone has no choice.
 
     Args:
       now: the tables `[T]`.
@@ -122,19 +113,13 @@ def explore(now: Look, rng: np.random.Generator, actions: int, *, may_push: bool
       may_push: whether pushes are allowed, too.
 
     Returns:
-      Which tables are pushed on `[T]` bool, and a push and a grasp for each `[T]`.
+      Which tables are pushed on `[T]` bool; none where no push can be begun.
     """
     count = len(now.grasp_value)
     explored = max(EXPLORED_AT_FIRST * EXPLORATION_DECAY**actions, EXPLORED_AT_LEAST)
-    random = rng.uniform(size=count) < explored
-    coin = rng.uniform(size=count) < 0.5
-    pushing = np.where(random, coin & now.can_push, now.push_value > now.grasp_value)
-    pushing &= may_push
-
-    def pick(best: Array, other: Array) -> Array:
-        return np.where(random.reshape(-1, *[1] * (best.ndim - 1)), other, best)
-
-    return pushing, jax.tree.map(pick, now.push, now.random_push), jax.tree.map(pick, now.grasp, now.random_grasp)
+    random, coin = rng.uniform(size=count) < explored, rng.uniform(size=count) < 0.5
+    pushing = np.where(random, coin, now.push_value > now.grasp_value)
+    return pushing & np.isfinite(now.push_value) & may_push
 
 
 def execute(

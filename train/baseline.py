@@ -17,12 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import files, structs
+from dipn_jax import files, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
+from dipn_jax.seeds import Purpose
 from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.world.scenes import SceneConfig
@@ -30,12 +31,14 @@ from dipn_jax.world.scenes import SceneConfig
 from . import acting, finite, tables
 from .acting import Look
 from .configs import BaselineConfig
-from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, view, windows
+from .grasp import GRASP_MIRRORS, PUSH_MIRRORS, SHIFT_PIXELS, WINDOW_PIXELS, Window, executed, windows
 from .loop import constant_adamw, make_step
 from .rounds import Run
 
 LEARNT_PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}
 """What each method learns: REA+DIPN uses REA's grasps only, DQN+GN has GN for its grasps."""
+MIRRORS = {"push": PUSH_MIRRORS, "grasp": GRASP_MIRRORS}
+"""Axes along which the images of a primitive may be mirrored."""
 PUSH_DISTANCE = 0.10
 """Metres of a push."""
 RECENT_ACTIONS = 100
@@ -69,14 +72,14 @@ class _Outcomes:
     def loss(self, model: nnx.Module, batch: dict[str, Window], key: jax.Array) -> jax.Array:
         """Return the Huber loss of values, or the cross entropy of chances, at executed pixels.
 
-        As published, nothing is mirrored.
+        Images are shifted, mirrored and recoloured as GN's are.
         """
         total = jnp.zeros(())
-        for name, some in batch.items():
-            images, pixel = view(some, jax.random.randint(key, (len(some.target), 2), 0, 2 * SHIFT_PIXELS))
-            out = getattr(model, name)(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
+        for name, part_key in zip(batch, jax.random.split(key, len(batch)), strict=True):
+            some = batch[name]
+            out = executed(part_key, getattr(model, name), some, mirrors=MIRRORS[name])
             if self.answers == "chance":
-                total += losses.score_loss(out, some.target, jnp.ones(len(images)))
+                total += losses.score_loss(out, some.target, jnp.ones(len(out)))
             else:
                 total += losses.smooth_l1(out - some.target).mean()
         return total
@@ -137,7 +140,8 @@ def _play(
     weights, statistics = jax.device_get((params, rest))
 
     def fresh() -> State:
-        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
+        purpose = Purpose.BASELINE_TABLES
+        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed, purpose=purpose)
         return State(weights, statistics, jax.device_get(optimizer.init(weights)), begun)
 
     def act(state: State) -> str:
@@ -160,15 +164,14 @@ def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, score
 def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneConfig, config: BaselineConfig) -> None:
     """Act once on every table; keep what happened and what it teaches."""
     count, before = config.tables, state.tables
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.round), (2, count))
     anew = np.ones(count, bool) if state.then is None else state.anew
-    now: Look = jax.device_get(look(keys[0], before.scene, before.poses, anew))
+    now: Look = jax.device_get(look(before.scene, before.poses, anew))
     if state.then is not None:
         now = jax.tree.map(lambda a, b: np.where(anew.reshape(-1, *[1] * (a.ndim - 1)), a, b), now, state.then)
     rng = np.random.default_rng([config.seed, state.round])
-    pushing, push, grasp = acting.explore(now, rng, len(state.did), may_push="push" in LEARNT_PARTS[config.method])
-    scene, poses, held, good = acting.execute(engine, before.scene, before.poses, pushing, push, grasp)
-    then: Look = jax.device_get(look(keys[1], scene, poses, np.ones(count, bool)))
+    pushing = acting.choose(now, rng, len(state.did), may_push="push" in LEARNT_PARTS[config.method])
+    scene, poses, held, good = acting.execute(engine, before.scene, before.poses, pushing, now.push, now.grasp)
+    then: Look = jax.device_get(look(scene, poses, np.ones(count, bool)))
     changed = acting.changed(now, then)
     success = np.asarray(held.any(1))
     effect = np.where(pushing, changed, success)
@@ -177,8 +180,8 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     if config.method != "rea":
         target = acting.with_future(reward, then, (scene.shape >= 0).any(1) & effect)
     for name, rows, centre, angle in (
-        ("push", pushing & good, push.start, push.angle),
-        ("grasp", ~pushing & good, grasp.center, grasp.angle),
+        ("push", pushing & good, now.push.start, now.push.angle),
+        ("grasp", ~pushing & good, now.grasp.center, now.grasp.angle),
     ):
         if name in LEARNT_PARTS[config.method] and rows.any():
             aim = Grasp(centre, angle, np.zeros(count, np.float32))
@@ -204,7 +207,7 @@ def _update(state: State, step: Callable[..., Any], config: BaselineConfig) -> t
         return state.params, state.rest, state.moments
     seen = {name: structs.concatenate(state.seen[name]) for name in parts}
     rng = np.random.default_rng([config.seed, state.round, 1])
-    key = jax.random.fold_in(jax.random.key(config.seed + 1), state.round)
+    key = jax.random.fold_in(seeds.key(config.seed, Purpose.BASELINE_TRAINING), state.round)
     params, rest, moments = jax.tree.map(jnp.array, (state.params, state.rest, state.moments))
     drawn = [
         {n: rng.integers(len(some.target), size=config.batch) for n, some in seen.items()}

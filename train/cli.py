@@ -62,8 +62,8 @@ def push(
     About four minutes on two cores:
       dipn-train push --data data/push --out runs/dipn
 
-    As published (a GPU's work; 50 epochs of 1,500 pushes):
-      dipn-train push --data data/push --out runs/paper --preset paper --optimizer sgd --learning-rate 1e-3 \
+    As published (a GPU's work; 50 epochs of 1,500 pushes; when the rate falls is our reading of the released code):
+      dipn-train push --data data/push --out runs/paper --preset paper --optimizer published --learning-rate 1e-3 \
         --batch 8 --weight-decay 2e-4 --limit 1500 --steps 9375 --centimetres 5
 
     Args:

@@ -27,8 +27,9 @@ class TrainConfig:
     """The highest learning rate of the run."""
     weight_decay: float = 1e-4
     """Weight decay."""
-    optimizer: Literal["adamw", "sgd"] = "adamw"
-    """adamw with cosine decay; or, as published, sgd with momentum 0.9 and a constant rate."""
+    optimizer: Literal["adamw", "sgd", "published"] = "adamw"
+    """adamw with cosine decay; sgd with momentum 0.9 and a constant rate; or published, as DIPN was: sgd whose rate
+    rises in the first epoch and falls to a tenth after each third of the steps."""
     seed: int = 0
     """Seed of weights, order and augmentation."""
     eval_every: int = 200
@@ -71,7 +72,7 @@ class BaselineConfig:
     """Pushes and grasps in all."""
     tables: int = 10
     """Tables that are acted on side by side."""
-    updates: int = 10
+    updates: int = 20
     """Optimizer steps after each round of one action on every table."""
     batch: int = 32
     """Outcomes in a step, of pushes and of grasps each."""

@@ -31,6 +31,10 @@ SHIFT_PIXELS = 4
 """Pixels by which a grasp is moved in its window at most, so that every phase of the network's strides is trained."""
 TABLE_WEIGHT = 0.05
 """Weight of a table pixel beside a foreground pixel: most of an image is table."""
+GRASP_MIRRORS = (1, 2)
+"""Axes `[B, row, col]` along which images of grasps may be mirrored: mirror images of grasps are grasps."""
+PUSH_MIRRORS = (1,)
+"""Axes along which images of pushes may be mirrored: only rows, because a push goes along the columns."""
 
 
 def turned_view(scene: Scene, poses: Array, center: Array, angle: Array, *, pixels: int) -> Observation:
@@ -39,9 +43,9 @@ def turned_view(scene: Scene, poses: Array, center: Array, angle: Array, *, pixe
     return render.render(scene, geometry.transform_poses(poses, -angle, shift), pixels=pixels)
 
 
-def _flips(key: jax.Array, images: jax.Array, *others: jax.Array) -> list[jax.Array]:
-    """Mirror examples at random along rows and columns, which is allowed because mirror images of grasps are grasps."""
-    for axis, axis_key in zip((1, 2), jax.random.split(key), strict=True):
+def _flips(key: jax.Array, axes: tuple[int, ...], images: jax.Array, *others: jax.Array) -> list[jax.Array]:
+    """Mirror examples at random along each of `axes`."""
+    for axis, axis_key in zip(axes, jax.random.split(key, len(axes)), strict=True):
         flip = jax.random.bernoulli(axis_key, 0.5, (images.shape[0],))
         both = [images, *others]
         both = [jnp.where(flip.reshape(-1, *[1] * (m.ndim - 1)), jnp.flip(m, axis), m) for m in both]
@@ -82,7 +86,7 @@ class PretrainTask:
     def loss(self, model: nnx.Module, batch: SettledScene, key: jax.Array) -> jax.Array:
         """See `loop.Task`."""
         view_key, flip_key = jax.random.split(key)
-        images, labels, weight = _flips(flip_key, *self.views(batch, view_key))
+        images, labels, weight = _flips(flip_key, GRASP_MIRRORS, *self.views(batch, view_key))
         return losses.score_loss(model(images), labels, weight)
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
@@ -129,17 +133,29 @@ def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
     return jax.device_get(batching.in_batches(functools.partial(_windows, pixels=pixels), episodes))
 
 
-def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array:
-    """Return the cross entropy of executed grasps `[B]`, each shifted, mirrored or not, with objects in new colours."""
+def executed(key: jax.Array, model: nnx.Module, batch: Window, *, mirrors: tuple[int, ...]) -> jax.Array:
+    """Return what a network says of executed actions `[B]`, each shifted, mirrored or not, with objects in new colours.
+
+    Args:
+      key: random key.
+      model: function of images `[B, S, S, 4]` that returns maps `[B, S, S]`.
+      batch: windows of the actions.
+      mirrors: axes along which the images may be mirrored.
+    """
     phase_key, flip_key, color_key = jax.random.split(key, 3)
     palette = jnp.asarray(shapes.COLORS_RGB, jnp.float32) / 255
     drawn = jax.random.randint(color_key, batch.color.shape[:2], 0, len(palette))
     batch = batch.replace(color=palette[drawn])  # colour must not tell the network what an object is
     images, pixel = view(batch, jax.random.randint(phase_key, (len(batch.target), 2), 0, 2 * SHIFT_PIXELS))
     mask = jnp.zeros(images.shape[:3]).at[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]].set(1.0)
-    images, mask = _flips(flip_key, images, mask)
-    logits = (model(images) * mask).sum((1, 2))
-    return losses.score_loss(logits, batch.target, jnp.ones(len(images)))
+    images, mask = _flips(flip_key, mirrors, images, mask)
+    return (model(images) * mask).sum((1, 2))
+
+
+def executed_loss(key: jax.Array, model: nnx.Module, batch: Window) -> jax.Array:
+    """Return the cross entropy of the scores of executed grasps `[B]`; see `executed`."""
+    logits = executed(key, model, batch, mirrors=GRASP_MIRRORS)
+    return losses.score_loss(logits, batch.target, jnp.ones(len(logits)))
 
 
 def view(batch: Window, begin: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -16,7 +16,7 @@ import optax
 import tensorboardX
 from flax import nnx
 
-from dipn_jax import console, files
+from dipn_jax import console, files, seeds
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner
@@ -26,6 +26,9 @@ from .configs import BaselineConfig, OnlineConfig, TrainConfig
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
 import grain  # noqa: E402
+
+LONGEST_RISE = 1000
+"""Steps that the rate of `published_rate` rises at most. Source: DIPN's released code."""
 
 
 class Taught(Protocol):
@@ -54,17 +57,31 @@ class Task(Taught, Protocol):
         ...
 
 
-def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
-    """Return the optimizer of a run, with its schedule."""
-    if config.optimizer == "sgd":
-        return optax.chain(
-            optax.add_decayed_weights(config.weight_decay), optax.sgd(config.learning_rate, momentum=0.9)
-        )
+def published_rate(config: TrainConfig, *, examples: int) -> optax.Schedule:
+    """Return the learning rate of a step as DIPN's released code plans it.
+
+    It rises from a thousandth during the first epoch (or LONGEST_RISE steps), and falls to a tenth after each third of
+    the run. That code compares whole epochs with thirds, so that there it falls only if their number is a multiple of
+    three, which the 50 of its README is not; the thirds are our reading.
+    """
+    rise = min(LONGEST_RISE, max(1, -(-examples // config.batch) - 1))
+    thirds = {-(-k * config.steps // 3): 0.1 for k in (1, 2)}
+    risen = optax.linear_schedule(config.learning_rate / 1000, config.learning_rate, rise)
+    fallen = optax.piecewise_constant_schedule(1.0, thirds)
+    return lambda step: risen(step) * fallen(step)
+
+
+def make_optimizer(config: TrainConfig, *, examples: int = 0) -> optax.GradientTransformation:
+    """Return the optimizer of a run on this number of examples, with its schedule."""
+    if config.optimizer in ("sgd", "published"):
+        constant = config.optimizer == "sgd"
+        rate = config.learning_rate if constant else published_rate(config, examples=examples)
+        return optax.chain(optax.add_decayed_weights(config.weight_decay), optax.sgd(rate, momentum=0.9))
     if config.optimizer == "adamw":
         warm = min(100, config.steps // 10 + 1)
         rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warm, max(config.steps, warm + 1))
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=config.weight_decay))
-    raise UserError(f"--optimizer {config.optimizer}: want adamw or sgd")
+    raise UserError(f"--optimizer {config.optimizer}: want adamw, sgd or published")
 
 
 def constant_adamw(config: OnlineConfig | BaselineConfig) -> optax.GradientTransformation:
@@ -117,7 +134,7 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
         a weight is not finite, after which nothing is saved.
     """
     _check(config, out)
-    optimizer = make_optimizer(config)
+    optimizer = make_optimizer(config, examples=task.size)
     with owner.owned(out):
         return _fit(task, config, out, optimizer, initial)
 
@@ -137,7 +154,7 @@ def _fit(
     order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
     step_fn = make_step(task, graph, optimizer)
     log = _Log(out, begin)
-    key = jax.random.key(config.seed)
+    key = seeds.key(config.seed, seeds.Purpose.TRAINING)
     latest: dict[str, float] = {}
     watch = finite.Watch(config.learning_rate, lambda k: np.asarray(order[k]), "the last finite checkpoint is kept")
 
@@ -225,7 +242,7 @@ def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> 
     files.claim(out, identity | {"steps": begun})
     if begun != config.steps:
         raise UserError(
-            f"{out}: its learning rate falls to 0 at --steps {begun}, so that it cannot go on to {config.steps}; give "
+            f"{out}: its learning rate is planned for --steps {begun}, so that it cannot go on to {config.steps}; give "
             f"--init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
         )
 

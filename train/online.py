@@ -13,11 +13,12 @@ import jax
 import numpy as np
 from flax import nnx
 
-from dipn_jax import files, structs
+from dipn_jax import files, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspNet, score_image
 from dipn_jax.planning import candidates
+from dipn_jax.seeds import Purpose
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
@@ -96,11 +97,12 @@ def _play(run: Run, model: GraspNet, engine: Engine, scenes: SceneConfig, config
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
     optimizer = constant_adamw(config)
     step = make_step(_Outcomes(), graph, optimizer)
-    key = jax.random.key(config.seed)
+    key = seeds.key(config.seed, Purpose.ONLINE_TRAINING)
     weights = jax.device_get(params)
 
     def fresh() -> State:
-        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed)
+        purpose = Purpose.ONLINE_TABLES
+        begun = tables.begin(engine, scenes, count=config.tables, seed=config.seed, purpose=purpose)
         return State(weights, jax.device_get(optimizer.init(weights)), begun)
 
     def act(state: State) -> str:

@@ -122,9 +122,10 @@ class PushTask:
         return structs.concatenate(parts)
 
     def loss(self, model: nnx.Module, batch: Example, key: jax.Array) -> jax.Array:
-        """See `loop.Task`: SmoothL1 in pixels and degrees; half of the examples are mirrored.
+        """See `loop.Task`: SmoothL1 in pixels and degrees.
 
-        `compact` learns all distances from every example; `paper`, which has one output, learns a random one.
+        `compact` learns all distances from every example, half of them mirrored; `paper`, which has one output, learns
+        a random one, and as in its released code nothing is mirrored and the loss is the mean over coordinates.
         """
         count = batch.taught.shape[0]
         distance_key, mirror_key = jax.random.split(key)
@@ -136,14 +137,15 @@ class PushTask:
             centimetres = jnp.take_along_axis(centimetres, drawn, 1)
             target = jnp.take_along_axis(target, drawn[:, None, :, None], 2)
             taught = jnp.take_along_axis(taught, drawn[:, None], 2)
-        flipped = jax.random.bernoulli(mirror_key, 0.5, (count,))
+        else:
+            inputs, target = _mirrored(mirror_key, inputs, target)
+        predicted = model(inputs, centimetres * 0.01)
+        return self._share * losses.motion_loss(predicted, target, inputs.present[..., None] & taught)
 
-        def pick(mirrored: Array, seen: Array) -> jax.Array:
-            return jnp.where(flipped.reshape(-1, *[1] * (seen.ndim - 1)), mirrored, seen)
-
-        inputs = jax.tree.map(pick, push_frame.mirror(inputs), inputs)
-        target = pick(push_frame.mirror_motion(target), target)
-        return losses.motion_loss(model(inputs, centimetres * 0.01), target, inputs.present[..., None] & taught)
+    @property
+    def _share(self) -> float:
+        """Factor of the sum over the three coordinates: `paper` takes the mean."""
+        return 1 / 3 if self.network_config.preset == "paper" else 1.0
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss, and position error of moved objects (mm), at the largest distance."""
@@ -160,9 +162,20 @@ class PushTask:
             else:
                 examples = structs.take(self._held_out, index)
             loss, error, moved = _measure(graph, state, examples, self.centimetres, jnp.asarray(weight))
-            total["held_out_loss"].append((float(loss), int(weight.sum())))
+            total["held_out_loss"].append((self._share * float(loss), int(weight.sum())))
             total["moved_error_mm"].append((float(error), float(moved)))
         return {name: sum(v * w for v, w in rows) / max(sum(w for _, w in rows), 1e-9) for name, rows in total.items()}
+
+
+def _mirrored(key: jax.Array, inputs: PushInput, target: Array) -> tuple[PushInput, jax.Array]:
+    """Mirror half of the examples `[B]`, at random, in the axis of the push."""
+    flipped = jax.random.bernoulli(key, 0.5, (target.shape[0],))
+
+    def pick(mirrored: Array, seen: Array) -> jax.Array:
+        return jnp.where(flipped.reshape(-1, *[1] * (seen.ndim - 1)), mirrored, seen)
+
+    inputs = jax.tree.map(pick, push_frame.mirror(inputs), inputs)
+    return inputs, pick(push_frame.mirror_motion(target), target)
 
 
 def _single(inputs: PushInput) -> PushInput:

@@ -8,8 +8,9 @@ import functools
 import jax
 import numpy as np
 
-from dipn_jax import structs
+from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
+from dipn_jax.seeds import Purpose
 from dipn_jax.storage import plain
 from dipn_jax.structs import Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
@@ -29,6 +30,7 @@ class Tables:
     poses: np.ndarray  # [T, N, 7]
     spare: SettledScene  # tables that replace others later
     seed: int
+    purpose: int  # a `seeds.Purpose`
     drawn: int = 1  # batches of tables that were drawn
     idle: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))  # [T] actions without effect
 
@@ -53,7 +55,8 @@ class Tables:
         again = ~good | outside | (idle >= IDLE_LIMIT) | ~(scene.shape >= 0).any(1)
         over = np.flatnonzero(again)
         while len(self.spare.fault) < len(over):
-            self.spare = structs.concatenate([self.spare, _draw(engine, config, self.seed, self.drawn, len(good))])
+            more = _draw(engine, config, seeds.key(self.seed, Purpose(self.purpose)), self.drawn, len(good))
+            self.spare = structs.concatenate([self.spare, more])
             self.drawn += 1
         fresh, self.spare = (structs.take(self.spare, part) for part in (slice(0, len(over)), slice(len(over), None)))
         self.poses = _replaced(over, poses, np.asarray(fresh.poses))
@@ -62,16 +65,16 @@ class Tables:
         return again
 
 
-def begin(engine: Engine, config: SceneConfig, *, count: int, seed: int) -> Tables:
+def begin(engine: Engine, config: SceneConfig, *, count: int, seed: int, purpose: Purpose) -> Tables:
     """Return `count` fresh tables."""
-    drawn = _draw(engine, config, seed, 0, count)
+    drawn = _draw(engine, config, seeds.key(seed, purpose), 0, count)
     first, spare = structs.take(drawn, slice(0, count)), structs.take(drawn, slice(count, None))
-    return Tables(first.scene, np.asarray(first.poses), spare, seed, idle=np.zeros(count, int))
+    return Tables(first.scene, np.asarray(first.poses), spare, seed, purpose, idle=np.zeros(count, int))
 
 
-def _draw(engine: Engine, config: SceneConfig, seed: int, batch: int, count: int) -> SettledScene:
+def _draw(engine: Engine, config: SceneConfig, key: jax.Array, batch: int, count: int) -> SettledScene:
     """Draw `2 * count` tables: twice the number that is acted on."""
-    return clutter.settled_scenes(jax.random.fold_in(jax.random.key(seed), batch), engine, config, 2 * count)
+    return clutter.settled_scenes(jax.random.fold_in(key, batch), engine, config, 2 * count)
 
 
 def _replaced(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 
-import jax
 import numpy as np
 
-from dipn_jax import structs
+from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.storage import plain
@@ -92,9 +91,16 @@ def hard_instances(
     return _instances([found[i] for i in index], scene, np.asarray(rollout.poses)[:, -1])
 
 
-def random_instances(engine: Engine, config: scenes.SceneConfig, *, count: int, seed: int) -> list[Instance]:
-    """Return `count` random settled scenes."""
-    items = clutter.settled_scenes(jax.random.key(seed), engine, config, count)
+def random_instances(
+    engine: Engine,
+    config: scenes.SceneConfig,
+    *,
+    count: int,
+    seed: int,
+    purpose: seeds.Purpose = seeds.Purpose.CLEARING_TABLES,
+) -> list[Instance]:
+    """Return `count` random settled scenes, drawn with the key of `purpose`."""
+    items = clutter.settled_scenes(seeds.key(seed, purpose), engine, config, count)
     return _instances([f"random-{i}" for i in range(count)], items.scene, np.asarray(items.poses))
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import console, files, geometry, structs
+from dipn_jax import console, files, geometry, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.planning import planner
 from dipn_jax.storage import resume
@@ -89,7 +89,7 @@ def clear(
 
 def action_key(seed: int, number: int, action: int) -> jax.Array:
     """Return the random key of one action on one table: of the noise of its image, and of the push candidates."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), number), action)
+    return jax.random.fold_in(jax.random.fold_in(seeds.key(seed, seeds.Purpose.CLEARING_CANDIDATES), number), action)
 
 
 def _push(rows: list[Instance], decision: Decision, engine: Engine, *, longest: float) -> None:

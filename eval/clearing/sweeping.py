@@ -13,7 +13,7 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import batching, console, geometry, structs
+from dipn_jax import batching, console, geometry, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
@@ -78,7 +78,7 @@ def prediction_errors(
     Returns:
       `sweep/DISTANCE/push_error/{all,moved}` with bootstrap 95 % intervals over scenes.
     """
-    key, aim = jax.random.split(jax.random.key(seed))
+    key, aim = jax.random.split(seeds.key(seed, seeds.Purpose.SWEEP_SCENES))
     items = clutter.settled_scenes(key, engine, config, scenes)
     keys = jax.random.split(aim, scenes)
     seen, pushes, feasible = batching.in_batches(_look, keys, items.scene, items.poses)

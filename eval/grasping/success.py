@@ -13,10 +13,11 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import batching, console, structs
+from dipn_jax import batching, console, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.planning import candidates, methods
 from dipn_jax.planning.planner import Scorer
+from dipn_jax.seeds import Purpose
 from dipn_jax.sight import render
 from dipn_jax.sight.fingers import label_image
 from dipn_jax.storage import resume
@@ -61,7 +62,7 @@ def evaluate(
     Returns:
       Flat metrics: success with bootstrap 95 % intervals over tables, calibration; and the tables, ended.
     """
-    tables = instances.random_instances(engine, config, count=scenes, seed=seed)
+    tables = instances.random_instances(engine, config, count=scenes, seed=seed, purpose=Purpose.GRASP_TABLES)
     result = _random_foreground(scorer, engine, tables, seed)
     decide = on_tables.in_lockstep(methods.grasping_policy(scorer), camera=camera)
     tables = lockstep.clear(tables, engine, decide, partial, seed=seed, remember=remember)
@@ -86,7 +87,7 @@ def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], s
     """Try a grasp of a random foreground pixel on each table; return how it went and what the scorer said."""
     scene = structs.stack([table.scene for table in tables])
     poses = np.stack([table.poses for table in tables])
-    keys = jax.random.split(jax.random.key(seed), len(tables))
+    keys = jax.random.split(seeds.key(seed, Purpose.RANDOM_GRASPS), len(tables))
     grasps, scores = batching.in_batches(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
     rollout, outcome = primitives.grasp(engine, scene, poses, jax.device_get(grasps))
     good = Fault.usable(rollout.fault)
@@ -178,8 +179,9 @@ def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: i
       seed: random seed of scenes and grasps.
       each: grasps on every scene.
     """
-    items = clutter.settled_scenes(jax.random.key(seed), engine, config, scenes)
-    keys = jax.random.split(jax.random.key(seed), scenes)
+    drop, aim = jax.random.split(seeds.key(seed, Purpose.SINGLE_OBJECTS))
+    items = clutter.settled_scenes(drop, engine, config, scenes)
+    keys = jax.random.split(aim, scenes)
     grasps, labels = batching.in_batches(functools.partial(_labelled, count=each), keys, items.scene, items.poses)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
     index = np.repeat(np.arange(scenes), each)

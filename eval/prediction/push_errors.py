@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import batching, console, geometry
+from dipn_jax import batching, console, geometry, seeds
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
@@ -67,12 +67,13 @@ def evaluate(
     predictors = _with_baselines(networks)
     rows: Rows = {}
     films: list[dict[str, np.ndarray]] = []
+    key = seeds.key(seed, seeds.Purpose.PREDICTION_SCENES)
     done, batch, rows, films = partial.load((0, 0, rows, films))
     with console.Progress("prediction", scenes, unit="pushes", done=done) as progress:
         empty = 0
         while done < scenes:
             count = min(batching.BATCH, scenes - done)
-            executed = execute(jax.random.fold_in(jax.random.key(seed), batch), engine, config, count, physics=physics)
+            executed = execute(jax.random.fold_in(key, batch), engine, config, count, physics=physics)
             if len(executed):
                 seen = executed.seen()
                 motions = measure(rows, executed, predictors, seen)

@@ -1,5 +1,6 @@
 """The compared methods: rewards, targets, tables, training, and interruptions of it."""
 
+import dataclasses
 import pathlib
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 from dipn_jax.train import acting, baseline, tables
 from dipn_jax.train.acting import Look
+from dipn_jax.train.grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, windows
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.planning import scorers
+from dipn_jax.seeds import Purpose
 from dipn_jax.storage import checkpoint, resume
 from dipn_jax.structs import Grasp, Push
 from dipn_jax.world import scenes
@@ -25,7 +28,7 @@ def _look(height: np.ndarray, grasp_value: float) -> Look:
     push = Push(np.zeros((count, 2)), np.zeros(count), np.zeros(count))
     grasp = Grasp(np.zeros((count, 2)), np.zeros(count), np.zeros(count))
     values = np.full(count, grasp_value)
-    return Look(height, push, values, push, np.ones(count, bool), grasp, values, grasp)
+    return Look(height, push, values, grasp, values)
 
 
 def _heights(*pixels: int) -> np.ndarray:
@@ -59,7 +62,7 @@ def test_a_target_has_the_value_of_the_best_next_action_but_no_impossible_one() 
 
 
 def test_finished_tables_are_set_anew(engine: Any) -> None:
-    played = tables.begin(engine, CONFIG, count=4, seed=0)
+    played = tables.begin(engine, CONFIG, count=4, seed=0, purpose=Purpose.BASELINE_TABLES)
     scene, poses = jax.tree.map(np.array, played.scene), played.poses.copy()
     scene.shape[0] = -1  # cleared
     poses[1, 0, 0] = 0.3  # spilt
@@ -72,12 +75,91 @@ def test_finished_tables_are_set_anew(engine: Any) -> None:
         assert again[3] == stuck
 
 
-def test_exploration_fades_and_reactive_grasps_never_push() -> None:
-    now = _look(_heights(*[1000] * 400), 0.5)
-    now = now.replace(push_value=np.full(400, 1.0))
-    early, late = (acting.explore(now, np.random.default_rng(0), n, may_push=True)[0].mean() for n in (0, 100_000))
-    assert early == pytest.approx(0.75, abs=0.07) and late == pytest.approx(0.95, abs=0.04)
-    assert not acting.explore(now, np.random.default_rng(0), 0, may_push=False)[0].any()
+def _tables(count: int, push_value: float) -> Look:
+    """Return tables whose pushes have this value, and whose grasps are worth 0.5."""
+    return _look(np.zeros((count, 1, 1)), 0.5).replace(push_value=np.full(count, push_value))
+
+
+def test_exploration_draws_the_primitive_in_equal_shares_and_fades() -> None:
+    """Half of the explored actions are what they would have been anyway: 0.5 / 2 then 0.1 / 2 differ."""
+    for better, share in ((1.0, 1.0), (0.0, 0.0)):
+        for actions, other in ((0, 0.25), (100_000, 0.05)):
+            pushing = acting.choose(_tables(4000, better), np.random.default_rng(0), actions, may_push=True)
+            assert pushing.mean() == pytest.approx(abs(share - other), abs=0.02)
+
+
+def test_nothing_is_pushed_where_no_push_can_be_begun_or_only_grasps_are_learnt() -> None:
+    for value, may_push in ((-np.inf, True), (1.0, False)):
+        assert not acting.choose(_tables(4000, value), np.random.default_rng(0), 0, may_push=may_push).any()
+
+
+@pytest.mark.parametrize("method", ["vpg", "rea", "dqn"])
+def test_an_explored_action_is_the_best_one_of_its_primitive(
+    method: Any, engine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every action is explored, and only the push or grasp with the highest value is executed."""
+    monkeypatch.setattr(acting, "EXPLORED_AT_LEAST", 1.0)
+    count, did = 40, {}
+    best = _tables(count, 1.0)
+    best = best.replace(push=best.push.replace(angle=np.linspace(0, 1, count)))
+    best = best.replace(grasp=best.grasp.replace(angle=np.linspace(2, 3, count)))
+
+    def execute(_: Any, scene: Any, poses: Any, pushing: Any, push: Push, grasp: Grasp) -> Any:
+        did.update(pushing=pushing, push=push.angle, grasp=grasp.angle)
+        return scene, poses, np.zeros((count, 3), bool), np.ones(count, bool)
+
+    monkeypatch.setattr(acting, "execute", execute)
+    begun = tables.begin(engine, CONFIG, count=2, seed=0, purpose=Purpose.BASELINE_TABLES)
+    many = dataclasses.replace(begun, scene=structs.take(begun.scene, np.zeros(count, int)), idle=np.zeros(count, int))
+    many.poses = np.repeat(begun.poses[:1], count, 0)
+    state = baseline.State(None, None, None, many)
+    config = baseline.BaselineConfig(method, tables=count)
+    baseline._act(state, lambda *_: best, engine, CONFIG, config)
+    pushes = did["pushing"].sum()
+    assert pushes == 0 if method == "rea" else 10 < pushes < 30
+    np.testing.assert_array_equal(did["push"], best.push.angle)
+    np.testing.assert_array_equal(did["grasp"], best.grasp.angle)
+    learnt = {name: sum(len(some.target) for some in state.seen[name]) for name in ("push", "grasp")}
+    assert learnt == {"push": pushes, "grasp": 0 if method == "dqn" else count - pushes}
+
+
+class _Recorder:
+    """A network whose maps are the heights; it keeps the images that it was shown."""
+
+    def __init__(self) -> None:
+        self.shown: dict[str, np.ndarray] = {}
+
+    def push(self, images: jax.Array) -> jax.Array:
+        self.shown["push"] = np.asarray(images)
+        return images[..., 3]
+
+    def grasp(self, images: jax.Array) -> jax.Array:
+        self.shown["grasp"] = np.asarray(images)
+        return images[..., 3]
+
+
+def test_outcomes_are_learnt_from_mirror_images_in_new_colours_and_pushes_are_never_turned_round() -> None:
+    """Heights rise along rows and along columns, so a mirrored image is told by its slopes."""
+    count, wide = 64, 32
+    rise = np.arange(wide)[:, None] / 64 + np.arange(wide) / 1024
+    some = Window(
+        np.broadcast_to(rise, (count, wide, wide)).astype(np.float16),
+        np.zeros((count, wide, wide), np.int8),
+        np.zeros((count, 1, 3), np.float32),
+        np.linspace(-3, 3, count).astype(np.float32),
+    )
+    network: Any = _Recorder()
+    outcomes = baseline._Outcomes("value")
+    loss = outcomes.loss(network, {"push": some, "grasp": some}, jax.random.key(0))
+    error = np.abs(rise[wide // 2, wide // 2] - np.asarray(some.target))
+    each = np.where(error < 1, 0.5 * error**2, error - 0.5).mean()
+    np.testing.assert_allclose(loss, 2 * each, rtol=1e-6)  # at the executed pixel, wherever that went
+    for name, turned in (("push", False), ("grasp", True)):
+        images = network.shown[name]
+        rows, cols = (np.diff(images[..., 3], axis=axis)[:, 0, 0] > 0 for axis in (1, 2))
+        assert 0.2 < rows.mean() < 0.8 and (0.2 < cols.mean() < 0.8 if turned else cols.all()), name
+        assert len(np.unique(images[:, 0, 0, :3], axis=0)) > 5, "objects keep their colours"
+        assert len(np.unique(images[cols & rows][:, 0, 0, 3])) > 3, "images are not shifted"
 
 
 def _flat_scores(images: jax.Array) -> jax.Array:
@@ -127,7 +209,6 @@ def test_the_published_form_takes_a_training_step(engine: Any) -> None:
     import functools
 
     import optax
-    from dipn_jax.train.grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window
     from dipn_jax.train.loop import make_step
     from flax import nnx
 
@@ -135,10 +216,9 @@ def test_the_published_form_takes_a_training_step(engine: Any) -> None:
 
     model = checkpoint.build("vpg", VpgConfig("paper", blocks=(1, 1, 1, 1)))
     graph, params, rest = nnx.split(model, nnx.Param, ...)  # type: ignore[misc]
-    played = tables.begin(engine, CONFIG, count=2, seed=1)
+    played = tables.begin(engine, CONFIG, count=2, seed=1, purpose=Purpose.BASELINE_TABLES)
     look = functools.partial(acting.look, graph, scorer=None, distance=0.1)
-    keys = jax.random.split(jax.random.key(0), 2)
-    seen = jax.eval_shape(look, params, rest, keys, played.scene, played.poses, np.ones(2, bool))
+    seen = jax.eval_shape(look, params, rest, played.scene, played.poses, np.ones(2, bool))
     assert seen.push_value.shape == seen.grasp_value.shape == (2,)
     wide = WINDOW_PIXELS["paper"] + 2 * SHIFT_PIXELS
     some = Window(
@@ -154,14 +234,13 @@ def test_the_published_form_takes_a_training_step(engine: Any) -> None:
 def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
     """A network fits two outcomes that differ only in the executed pixel."""
     import optax
-    from dipn_jax.train.grasp import SHIFT_PIXELS, WINDOW_PIXELS, windows
     from dipn_jax.train.loop import make_step
     from flax import nnx
 
     from dipn_jax.networks.vpg import VpgConfig
     from dipn_jax.structs import GraspEpisode
 
-    played = tables.begin(engine, CONFIG, count=2, seed=1)
+    played = tables.begin(engine, CONFIG, count=2, seed=1, purpose=Purpose.BASELINE_TABLES)
     center = played.poses[:, 0, :2]
     aim = Grasp(np.stack([center[0], center[0] + [0.0, 0.06]]), np.zeros(2), np.zeros(2))
     first = structs.take(played.scene, np.zeros(2, int)), played.poses[np.zeros(2, int)]

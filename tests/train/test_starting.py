@@ -24,7 +24,7 @@ def test_the_refusal_of_more_steps_says_how_and_a_run_starts_from_another(
     assert tuned.config == begun.config
     for a, b in zip(*(jax.tree.leaves(nnx.state(one, nnx.Param)) for one in (begun, tuned)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # the rate of the first step is 0
-    with pytest.raises(UserError, match=f"falls to 0 at --steps 1, .* --init {tmp_path / 'a'} and another --out"):
+    with pytest.raises(UserError, match=f"is planned for --steps 1, .* --init {tmp_path / 'a'} and another --out"):
         cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=TrainConfig(steps=2, batch=2))
 
 
