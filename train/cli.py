@@ -193,7 +193,8 @@ def baseline(
 ) -> None:
     """Train a compared method while it acts: VPG, the grasps of its reactive form (REA), or DQN's pushes beside GN.
 
-    With the samples that the paper gives them, 10 to 25 minutes each on two cores:
+    Only vpg and dqn explore, by drawing push or grasp at random. With the samples that the paper gives them, 10 to 40
+    minutes each on two cores:
       dipn-train baseline --method vpg --actions 2500 --out runs/vpg
       dipn-train baseline --method rea --actions 1500 --out runs/rea
       dipn-train baseline --method dqn --actions 1500 --grasp-net runs/gn --out runs/dqn
