@@ -101,6 +101,7 @@ def _train(
     vpg = run(f"{at}/vpg", f"{act} vpg --actions {samples['vpg']}", seeded)
     return {
         "dipn+gn": ("--push-net", dipn, "--grasp-net", gn),
+        "dipn+gn+actions": ("--method dipn+gn+actions --push-net", dipn, "--grasp-net", gn),
         "gn": ("--method gn --grasp-net", gn),
         "rea+dipn": ("--method rea+dipn --push-net", other, "--value-net", rea),
         "dqn+gn": ("--method dqn+gn --value-net", dqn, "--grasp-net", gn),
@@ -112,6 +113,7 @@ def _shipped(run: Recipe) -> None:
     """Add the networks that come with the package, which learnt from more than any budget here."""
     methods = {
         "dipn+gn": BUILTIN,
+        "dipn+gn+actions": f"--method dipn+gn+actions {BUILTIN}",
         "gn": "--method gn --grasp-net builtin",
         "physics+gn": "--method physics+gn --masks true --grasp-net builtin",
     }

@@ -127,7 +127,7 @@ def _table(values: dict[str, Any], head: str, rows: dict[str, str], *, spread: b
 
 KINDS = ("heldout", "hard", "random-10", "random-30")
 """Kinds of tables, in the order of the page."""
-METHODS = ("dipn+gn", "gn", "dqn+gn", "rea+dipn", "vpg", "physics+gn")
+METHODS = ("dipn+gn", "dipn+gn+actions", "gn", "dqn+gn", "rea+dipn", "vpg", "physics+gn")
 """Methods in the order of the tables."""
 
 

@@ -10,14 +10,14 @@ import pathlib
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Key
 
 from dipn_jax.errors import UserError
 from dipn_jax.names import ALL_AIDS, Aid, MethodName
 from dipn_jax.networks import vpg
-from dipn_jax.planning import planner, predictors, scorers
+from dipn_jax.planning import acts, outlook, planner, predictors, scorers
+from dipn_jax.planning.acts import Act
 from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
 from dipn_jax.sight import observed
 from dipn_jax.storage import checkpoint
@@ -32,9 +32,6 @@ ROLES: dict[NetworkRole, tuple[str, str]] = {
 """What a network does in a method -> its name in checkpoints, and the dipn-train command that trains it."""
 LONGEST_PUSH = 0.12
 """Length in metres of the longest push: simulated and learnt pushes of 10 cm, and a little beyond."""
-
-Act = Callable[[Array, Observation, Array, Rule, Array], Decision]
-"""(key, observation, grasps that missed [M, 3], rule, distances of the candidates [P] metres) -> decision."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,38 +173,8 @@ def load_policy(
 
 def grasping_policy(scorer: Scorer) -> Policy:
     """Return the policy that grasps where `scorer` is highest, and never pushes."""
-    act = imagining(predictors.static_predictor, scorer, None)
+    act = acts.imagining(predictors.static_predictor, scorer, None)
     return Policy(act, Rule(grasp_above=-1.0), np.array([0.1], np.float32))
-
-
-def imagining(predictor: planner.Predictor, scorer: Scorer, summarize: ScoreSummary | None) -> Act:
-    """Return the function that decides by Alg. 2: it imagines the image after every candidate push."""
-
-    def act(key: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
-        count = len(distances)
-        return planner.decide(
-            key, seen, predictor, scorer, count=count, distance=distances, rule=rule, summarize=summarize, missed=missed
-        )
-
-    return act
-
-
-def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Act:
-    """Return the function that compares the best push and the best grasp by value; pushes go the first distance.
-
-    Args:
-      push_scorer: values of pushes.
-      scorer: values of grasps.
-      grasp_at_once: whether to grasp at once above the rule's `grasp_above`.
-    """
-
-    def act(_: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
-        above = rule.grasp_above if grasp_at_once else jnp.inf
-        return planner.decide_by_value(
-            seen, push_scorer, scorer, distance=distances[0], grasp_above=above, missed=missed
-        )
-
-    return act
 
 
 def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSummary]:
@@ -220,26 +187,33 @@ def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSum
 
 
 def _dipn_gn(runs: Runs, config: PolicyConfig) -> Policy:
-    act = imagining(predictors.load_predictor(runs["push"]), *gn_scores(runs["grasp"], config))
+    act = acts.imagining(predictors.load_predictor(runs["push"]), *gn_scores(runs["grasp"], config))
+    return Policy(act, config.rule(), config.spread())
+
+
+def _dipn_gn_actions(runs: Runs, config: PolicyConfig) -> Policy:
+    scorer, summarize = gn_scores(runs["grasp"], config)
+    estimate = outlook.misses_to_come(scorer)
+    act = acts.imagining(predictors.load_predictor(runs["push"]), scorer, summarize, estimate=estimate)
     return Policy(act, config.rule(), config.spread())
 
 
 def _rea_dipn(runs: Runs, config: PolicyConfig) -> Policy:
     table = "table" in config.aids
     summary = scorers.load_summary(runs["value"], network="vpg", whole=config.released, table=table)
-    act = imagining(predictors.load_predictor(runs["push"]), _chances(runs["value"], config.aids), summary)
+    act = acts.imagining(predictors.load_predictor(runs["push"]), _chances(runs["value"], config.aids), summary)
     return Policy(act, config.rule(), config.spread())
 
 
 def _dqn_gn(runs: Runs, config: PolicyConfig) -> Policy:
     scorer = scorers.load_scorer(runs["grasp"], aids=config.aids)
-    act = comparing(_part(runs["value"], "push"), scorer, grasp_at_once=True)
+    act = acts.comparing(_part(runs["value"], "push"), scorer, grasp_at_once=True)
     return Policy(act, config.rule(), config.spread())
 
 
 def _vpg(runs: Runs, config: PolicyConfig) -> Policy:
     pushes, grasps = _part(runs["value"], "push"), _part(runs["value"], "grasp", config.aids)
-    act = comparing(pushes, grasps, grasp_at_once=False)
+    act = acts.comparing(pushes, grasps, grasp_at_once=False)
     return Policy(act, config.rule(), config.spread())
 
 
@@ -277,6 +251,9 @@ def _part(run: pathlib.Path, name: str, aids: tuple[Aid, ...] = ()) -> Scorer:
 
 METHODS: dict[str, Method] = {
     "dipn+gn": Method(("push", "grasp"), _dipn_gn, "imagine every push with DIPN, compare GN's mean scores"),
+    "dipn+gn+actions": Method(
+        ("push", "grasp"), _dipn_gn_actions, "the same pushes, made where they save more than the action they cost"
+    ),
     "rea+dipn": Method(("push", "value"), _rea_dipn, "the same with REA's grasp network in place of GN"),
     "dqn+gn": Method(("value", "grasp"), _dqn_gn, "GN for grasps, Q-learning for pushes"),
     "vpg": Method(("value",), _vpg, "two Q-functions, one of pushes and one of grasps"),

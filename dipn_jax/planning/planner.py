@@ -27,6 +27,8 @@ ScoreSummary = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.
 """(image now [224, 224, 4], images [P, ...], wanted [P] bool) -> mean and highest of all scores on each, [1 + P] both.
 
 Index 0 is the image now. Images that are not wanted may get any finite numbers."""
+Estimate = Callable[[Observation, jax.Array], jax.Array]
+"""(observation, grasps that missed [M, 3]) -> how many grasps are expected to miss until the table is empty []."""
 
 NONE_MISSED = np.full((1, 3), -1, np.int32)
 """The value of `missed` when no grasp has missed."""
@@ -115,9 +117,7 @@ def decide_among(
       rule: how to compare.
     """
     centers, area = masks.mask_centers(observation.label, observation.slots)
-    small = jnp.linalg.norm(motion[..., :2], axis=-1) < UNDRAWN_SHIFT
-    small &= jnp.abs(motion[..., 2]) < UNDRAWN_TURN
-    drawn = jnp.where(small[..., None] & ~jnp.asarray(rule.draw_all), 0.0, motion)
+    drawn = _drawn(motion, rule)
     inside = jax.vmap(candidates.stays_inside, in_axes=(None, None, 0))(centers, area, rule.edge_factor * motion)
     allowed = found.feasible & inside & ~found.grasp_now
     now = render.rgbd(observation)
@@ -150,7 +150,32 @@ def decide_among(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "summarize"))
+def _drawn(motion: Float[Array, "*b 3"], rule: Rule) -> Float[jax.Array, "*b 3"]:
+    """Return motions as they are drawn: small ones are none, unless the rule says otherwise."""
+    small = jnp.linalg.norm(motion[..., :2], axis=-1) < UNDRAWN_SHIFT
+    small &= jnp.abs(motion[..., 2]) < UNDRAWN_TURN
+    return jnp.where(small[..., None] & ~jnp.asarray(rule.draw_all), 0.0, motion)
+
+
+def _count_actions(
+    decision: Decision, observation: Observation, missed: Int[jax.Array, "M 3"], estimate: Estimate, rule: Rule
+) -> Decision:
+    """Return the decision between the same grasp and push by the actions that each costs.
+
+    A push is one action, and has to save more than one grasp that misses. The values are minus the expected numbers of
+    actions besides one for each object.
+    """
+    centers, _ = masks.mask_centers(observation.label, observation.slots)
+    now = estimate(observation, missed)
+
+    def after() -> jax.Array:
+        return 1.0 + estimate(imagine.imagine(observation, centers, _drawn(decision.motion, rule)), missed)
+
+    cost = jax.lax.cond(jnp.isfinite(decision.value_push), after, lambda: jnp.float32(jnp.inf))
+    return decision.replace(is_push=cost < now, value_now=-now, value_push=-cost)
+
+
+@functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "summarize", "estimate"))
 def decide(
     key: Key[Array, ""],
     observation: Observation,
@@ -162,6 +187,7 @@ def decide(
     rule: Rule = Rule(),  # noqa: B008
     summarize: ScoreSummary | None = None,
     missed: Int[Array, "M 3"] = NONE_MISSED,
+    estimate: Estimate | None = None,
 ) -> Decision:
     """Choose between the best grasp and the best push (Alg. 2 of the paper).
 
@@ -181,15 +207,21 @@ def decide(
       rule: how to compare.
       summarize: mean and highest score of all grasps on images; every image is scored whole by default.
       missed: `[M, 3]` grasps that missed on this table as it is; see `candidates.discount_missed`.
+      estimate: misses to come; if given, the best push is made when it saves more than the action that it costs.
 
     Returns:
       The decision. A push is chosen when gamma times the mean score of all grasps on its predicted image
       exceeds the mean score now; a push that would move any centre out of the workspace is dropped.
     """
     found = find_candidates(key, observation, scorer, rule, count=count, distance=distance, missed=missed)
+    if estimate is not None:
+        found = found.replace(grasp_now=found.grasp_now | (estimate(observation, jnp.asarray(missed)) <= 1.0))
     still = lambda: jnp.zeros((count, observation.slots, 3))  # noqa: E731
     motion = jax.lax.cond(found.grasp_now, still, lambda: predictor(observation, found.pushes))
-    return decide_among(observation, found, motion, summarize or summarize_whole(scorer), rule)
+    decision = decide_among(observation, found, motion, summarize or summarize_whole(scorer), rule)
+    if estimate is None:
+        return decision
+    return _count_actions(decision, observation, jnp.asarray(missed), estimate, rule)
 
 
 @functools.partial(jax.jit, static_argnames=("push_scorer", "scorer"))

@@ -38,6 +38,8 @@ def clear(
       dipn-eval clear --push-net builtin --grasp-net builtin --cases hard --instances 10 --out results/hard
       dipn-eval clear --push-net builtin --grasp-net builtin --cases random --objects 30 --instances 30 --out results/30
 
+    With pushes only where they save more than the action that they cost: --method dipn+gn+actions.
+
     The compared methods: gn (grasps only), physics+gn (the engine itself as predictor), and with networks of dipn-train
     baseline rea+dipn, dqn+gn and vpg:
       dipn-eval clear --method dqn+gn --value-net runs/dqn --grasp-net builtin --out results/dqn

@@ -1,0 +1,61 @@
+"""The functions that decide on one table: by Alg. 2, which imagines what pushes would do, or by values alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from dipn_jax.planning import planner
+from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
+from dipn_jax.structs import Array, Decision, Observation
+
+Act = Callable[[Array, Observation, Array, Rule, Array], Decision]
+"""(key, observation, grasps that missed [M, 3], rule, distances of the candidates [P] metres) -> decision."""
+
+
+def imagining(
+    predictor: planner.Predictor,
+    scorer: Scorer,
+    summarize: ScoreSummary | None,
+    *,
+    estimate: planner.Estimate | None = None,
+) -> Act:
+    """Return the function that decides by Alg. 2: it imagines the image after every candidate push.
+
+    With an `estimate` of the misses to come a push has to save more than the action that it costs.
+    """
+
+    def act(key: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
+        return planner.decide(
+            key,
+            seen,
+            predictor,
+            scorer,
+            count=len(distances),
+            distance=distances,
+            rule=rule,
+            summarize=summarize,
+            missed=missed,
+            estimate=estimate,
+        )
+
+    return act
+
+
+def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Act:
+    """Return the function that compares the best push and the best grasp by value; pushes go the first distance.
+
+    Args:
+      push_scorer: values of pushes.
+      scorer: values of grasps.
+      grasp_at_once: whether to grasp at once above the rule's `grasp_above`.
+    """
+
+    def act(_: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
+        above = rule.grasp_above if grasp_at_once else jnp.inf
+        return planner.decide_by_value(
+            seen, push_scorer, scorer, distance=distances[0], grasp_above=above, missed=missed
+        )
+
+    return act
