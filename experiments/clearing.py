@@ -147,7 +147,7 @@ def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
     """Write the tables of clearing.md, clearing.json and the figure of the sweep to `docs`, from what is kept."""
     listed, results = list_runs(root), Kept(docs / KEPT.name)
     values = clearing_tables.numbers(listed, results)
-    tables = clearing_tables.all_tables(values)
+    section = clearing_tables.section(values)
     values[pages.MADE] = results.made(listed)
     folder = root / "clear" / "sweep"
     if (folder / "metrics.json").exists():
@@ -155,8 +155,8 @@ def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
         sweep = {key: value for key, value in found.items() if key.startswith("sweep/")}
         files.write_json(docs / "sweep.json", sweep)
         shutil.copy(folder / "sweep.png", docs / "sweep.png")
-    tables.append(clearing_tables.swept(files.read_json(docs / "sweep.json")))
-    pages.write("clearing", values, tables, docs=docs)
+    tables = [clearing_tables.swept(files.read_json(docs / "sweep.json"))]
+    pages.write("clearing", values, tables, docs=docs, section=section)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -125,19 +125,22 @@ def _table(values: dict[str, Any], head: str, rows: dict[str, str], *, spread: b
     return "\n".join(lines) + "\n"
 
 
-KINDS = ("heldout", "hard", "random-10", "random-30")
-"""Kinds of tables, in the order of the page."""
 METHODS = ("dipn+gn", "dipn+gn+actions", "gn", "dqn+gn", "rea+dipn", "vpg", "physics+gn")
 """Methods in the order of the tables."""
 
 
 def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
-    """Return a table of all methods on one kind of tables, in per cent, with the paper's numbers for the same."""
+    """Return a table of all methods on one kind of tables, in per cent; of bare ones with the paper's numbers.
+
+    Empty if nothing is known of any.
+    """
     rows = {
         f"table/{on}/{budget}/{aids}/{method}": f"{method}, {budget}"
         for budget in ("shipped", "large", "paper")
         for method in METHODS
     }
+    if not any(f"{at}/tables" in values for at in rows):
+        return ""
     text = _table(values, f"{on}, {'all aids' if aids == 'all' else 'bare'}", rows, spread=True)
     for method, published in paper.TABLE.get(on, {}).items() if aids == "bare" else ():
         found = dict(zip(paper.COLUMNS, published, strict=True))
@@ -146,27 +149,45 @@ def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
     return text
 
 
-def all_tables(values: dict[str, Any]) -> list[str]:
-    """Return all tables of the page but the one of the sweep."""
-    tables = [of_methods(values, on, aids) for on in KINDS for aids in ("all", "bare")]
-    shipped = "table/{}/shipped/all/dipn+gn"
-    masks = {}
-    for on in KINDS:
-        masks[shipped.format(on)] = f"{on}, masks found in the image"
-        masks[f"masks/{on}/true"] = f"{on}, the simulator's masks"
-    noise = {shipped.format("heldout"): "no noise"} | _named(values, "noise")
-    aids = {shipped.format("heldout"): "all aids", "table/heldout/shipped/bare/dipn+gn": "none"}
+SECTIONS = {
+    "heldout": "Held-out hard tables: nothing was chosen by them",
+    "hard": "The ten hard tables of the paper, by which the aids were chosen",
+    "random-10": "10 objects, dropped at random",
+    "random-30": "30 objects, dropped at random",
+}
+"""Kinds of tables in the order of the page, and their titles."""
+
+
+def section(values: dict[str, Any]) -> str:
+    """Return all tables of the page that have rows, with headings, but the one of the sweep."""
+    shipped, parts = "table/{}/shipped/all/dipn+gn", {}
+    for on, title in SECTIONS.items():
+        parts[title] = "\n".join(text for aids in ("all", "bare") if (text := of_methods(values, on, aids)))
+    masks: dict[str, str] = {}
+    for on in SECTIONS:
+        if f"masks/{on}/true/tables" in values:
+            masks |= {shipped.format(on): f"{on}, found in the image", f"masks/{on}/true": f"{on}, the simulator's"}
+    base = {shipped.format("heldout"): "as it is"}
+    aids = base | {"table/heldout/shipped/bare/dipn+gn": "without any aid"}
     for aid in ABLATED:
         aids |= {f"aids/without/{aid}": f"all but `{aid}`", f"aids/alone/{aid}": f"`{aid}` alone"}
-    distance = {shipped.format("heldout"): "10 cm", "distance/chosen": "3 to 12 cm, chosen"}
-    return [
-        *tables,
-        _table(values, "masks", masks),
-        _table(values, "noise, heldout", noise),
-        _table(values, "aids, heldout", aids),
-        _table(values, "changed worlds", _named(values, "changed")),
-        _table(values, "distance, heldout", distance),
-    ]
+    distance = {"distance/chosen": "3 to 12 cm, chosen for each push"}
+    others: tuple[tuple[str, str, dict[str, str], dict[str, str]], ...] = (
+        ("Masks", "masks of DIPN+GN", {}, masks),
+        ("Noise of the camera", "noise, DIPN+GN on held-out tables", base, _named(values, "noise")),
+        (
+            "What each aid is worth",
+            "aids, DIPN+GN on held-out tables",
+            base,
+            {k: v for k, v in aids.items() if k not in base},
+        ),
+        ("Changed worlds", "random tables", {}, _named(values, "changed")),
+        ("A distance for every push", "push, DIPN+GN on held-out tables", base, distance),
+    )
+    for title, head, first, rows in others:
+        there = {at: name for at, name in rows.items() if f"{at}/tables" in values}
+        parts[title] = _table(values, head, first | there) if there else ""
+    return "\n" + "".join(f"## {title}\n\n{text}\n" for title, text in parts.items() if text)
 
 
 def _named(values: dict[str, Any], kind: str) -> dict[str, str]:

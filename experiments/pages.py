@@ -19,6 +19,10 @@ BOX_BEGINS = "<!-- box: begin -->"
 """Line of a page after which its box stands."""
 BOX_ENDS = "<!-- box: end -->"
 """Line of a page before which its box ends."""
+TABLES_BEGIN = "<!-- tables: begin -->"
+"""Line of a page after which tables stand that come and go with the results."""
+TABLES_END = "<!-- tables: end -->"
+"""Line of a page before which they end."""
 BOX_WIDTH = 110
 """Length of a line of the box in characters."""
 
@@ -94,10 +98,23 @@ def with_box(text: str, content: str) -> str:
     Raises:
       UserError: the page has no markers for it.
     """
-    before, begins, rest = text.partition(f"{BOX_BEGINS}\n")
-    _, ends, after = rest.partition(f"{BOX_ENDS}\n")
+    return _between(text, content, BOX_BEGINS, BOX_ENDS, "box")
+
+
+def with_tables(text: str, content: str) -> str:
+    """Return the page `text` with `content` as its section of tables.
+
+    Raises:
+      UserError: the page has no markers for it.
+    """
+    return _between(text, content, TABLES_BEGIN, TABLES_END, "tables")
+
+
+def _between(text: str, content: str, begin: str, end: str, what: str) -> str:
+    before, begins, rest = text.partition(f"{begin}\n")
+    _, ends, after = rest.partition(f"{end}\n")
     if not begins or not ends:
-        raise UserError(f"the page has no place for its box: add the lines {BOX_BEGINS} and {BOX_ENDS}")
+        raise UserError(f"the page has no place for its {what}: add the lines {begin} and {end}")
     return f"{before}{begins}{content}{ends}{after}"
 
 
@@ -117,7 +134,9 @@ def with_table(text: str, table: str) -> str:
     return before + table + "".join(rows)
 
 
-def write(name: str, values: dict[str, Any], tables: Sequence[str], *, docs: pathlib.Path) -> None:
+def write(
+    name: str, values: dict[str, Any], tables: Sequence[str], *, docs: pathlib.Path, section: str | None = None
+) -> None:
     """Write `NAME.json` and put the tables and the box into `NAME.md`, which must have places for them.
 
     Args:
@@ -125,9 +144,12 @@ def write(name: str, values: dict[str, Any], tables: Sequence[str], *, docs: pat
       values: its JSON.
       tables: tables as Markdown.
       docs: folder of the page.
+      section: tables that come and go with the results, as Markdown with headings.
     """
     page = docs / f"{name}.md"
     text = with_box(files.read_text(page), box(values))
+    if section is not None:
+        text = with_tables(text, section)
     for table in tables:
         text = with_table(text, table)
     files.write_json(docs / f"{name}.json", values)

@@ -9,7 +9,7 @@ import pytest
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
-from experiments import clearing, demo, grasping, pages, push_prediction, runs
+from experiments import clearing, clearing_tables, demo, grasping, pages, push_prediction, runs
 
 DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"
 PAGES = {"push-prediction": push_prediction, "grasping": grasping, "clearing": clearing, "demo": demo}
@@ -35,9 +35,11 @@ def test_the_boxes_in_docs_are_those_of_the_kept_facts(name: str) -> None:
 def test_the_pages_in_docs_show_the_figures_in_docs(name: str) -> None:
     page: ModuleType = PAGES[name]
     text, values = (DOCS / f"{name}.md").read_text(), files.read_json(DOCS / f"{name}.json")
-    tables = page.tables(values)
     if page is clearing:
-        tables.append(page.swept(files.read_json(DOCS / "sweep.json")))
+        assert pages.with_tables(text, clearing_tables.section(values)) == text
+        tables = [clearing_tables.swept(files.read_json(DOCS / "sweep.json"))]
+    else:
+        tables = page.tables(values)
     for table in tables:
         assert table in text and pages.with_table(text, table) == text
 
@@ -153,22 +155,18 @@ def test_the_page_of_grasping_is_written(docs: pathlib.Path) -> None:
     assert (docs / "grasping-reliability.png").read_bytes() == b"picture of reliability.png"
 
 
-def test_the_page_of_clearing_is_written(docs: pathlib.Path) -> None:
-    values, sweep = _figures("clearing"), files.read_json(DOCS / "sweep.json")
-    root = docs.parent
-    for run in clearing.list_runs(root):
-        if run.name.startswith("table/"):
-            asked = runs.parse(run)
-            cases, objects = asked["tables"].cases, asked["tables"].objects
-            on = cases if cases == "hard" else f"random-{objects}"
-            _put(run.out, _under(values, f"clear/{on}/{asked['label']}/{asked['method']}"))
-            settings = {"method": asked["method"], "label": asked["label"]}
-            settings |= {"tables.cases": cases, "tables.objects": objects}
-            files.write_json(run.out / "settings.json", settings)
-            files.write_json(run.out / "episodes.json", [])
-    _put(root / "clear" / "sweep", {**sweep, "other": 1}, "sweep.png")
-    clearing.write_page(root, docs=docs)
-    _unchanged(docs, "clearing", values)
+def test_the_page_of_clearing_is_what_is_kept(docs: pathlib.Path) -> None:
+    values, sweep = files.read_json(DOCS / "clearing.json"), files.read_json(DOCS / "sweep.json")
+    for name in ("clearing-tables.json", "sweep.json"):
+        shutil.copy(DOCS / name, docs)
+    clearing.write_page(docs.parent, docs=docs)
+    written = files.read_json(docs / "clearing.json")
+    assert written.keys() == values.keys() and written[pages.MADE] == values[pages.MADE]
+    for key in values.keys() - {pages.MADE}:
+        assert written[key] == pytest.approx(values[key]), key
+    assert (docs / "clearing.md").read_text() == (DOCS / "clearing.md").read_text()
+    _put(docs.parent / "clear" / "sweep", {**sweep, "other": 1}, "sweep.png")
+    clearing.write_page(docs.parent, docs=docs)
     assert files.read_json(docs / "sweep.json") == sweep
 
 
