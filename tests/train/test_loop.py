@@ -215,8 +215,8 @@ def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Pat
 
 @pytest.mark.slow
 def test_the_published_networks_take_a_training_step(data: dict[str, pathlib.Path]) -> None:
-    """Traced, not compiled; the networks themselves are trained in the tests of networks."""
-    dipn, gn = DipnConfig(preset="paper"), GraspConfig(preset="paper")
+    """Traced, not compiled, with one block a stage; the networks themselves are trained in the tests of networks."""
+    dipn, gn = (config(preset="paper", stages=(1, 1, 1, 1)) for config in (DipnConfig, GraspConfig))
     tasks = (
         PushTask(data["push"], dipn, limit=None, centimetres=(5, 10)),
         PretrainTask(data["images"], gn),

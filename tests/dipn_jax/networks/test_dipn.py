@@ -198,7 +198,7 @@ def test_the_prediction_at_a_distance_does_not_depend_on_the_other_distances(for
 
 @pytest.mark.slow
 def test_paper_dipn_takes_a_training_step(settled: Any, one_step: Any) -> None:
-    model = dipn.DIPN(dipn.DipnConfig(preset="paper"), rngs=nnx.Rngs(0))
+    model = dipn.DIPN(dipn.DipnConfig(preset="paper", stages=(1, 1, 1, 1)), rngs=nnx.Rngs(0))
     height, label = render.render_depth(structs.take(settled.scene, 0), settled.poses[0])
     made, _ = push_frame.push_input(label, height, _push(), slots=SLOTS, view=PAPER)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), made)
