@@ -102,7 +102,7 @@ def random_scene(key: Key[Array, ""], *, config: SceneConfig) -> tuple[Scene, Fl
       bounding spheres of those before it, or rows of `packing`. Empty slots are parked outside the workspace.
     """
     n, ranges = config.slots, config.ranges
-    keys = jax.random.split(key, 9)
+    keys = jax.random.split(key, 10)
     items = [i for i in shapes.CATALOGUE if not ranges.items or i.name in ranges.items]
     classes = jnp.array([shapes.CLASSES.index(i.shape) for i in items])
     nominal = jnp.array([i.size_mm for i in items], jnp.float32) / 1000
@@ -125,7 +125,7 @@ def random_scene(key: Key[Array, ""], *, config: SceneConfig) -> tuple[Scene, Fl
     z = _stack_heights(xy, radius, present)
     poses = jnp.concatenate([xy, z[:, None], quat], -1)
     if ranges.packed:
-        pack_key, which_key = jax.random.split(jax.random.fold_in(key, 1))
+        pack_key, which_key = jax.random.split(keys[9])
         rows = packing.pack(pack_key, shape, size, present)
         poses = jnp.where(jax.random.bernoulli(which_key, ranges.packed), rows, poses)
     poses = jnp.where(present[:, None], poses, parked(n))

@@ -62,7 +62,7 @@ def packed(label: Int[Array, "H W"]) -> np.ndarray:
     return np.frombuffer(zlib.compress(np.asarray(label, np.int8).tobytes()), np.uint8)
 
 
-def _unpacked(label: np.ndarray) -> np.ndarray:
+def unpacked(label: np.ndarray) -> np.ndarray:
     """Return the labels `[H, W]` int8 of `packed`."""
     side = WORKSPACE.pixels
     return np.frombuffer(zlib.decompress(label.tobytes()), np.int8).reshape(side, side)
@@ -73,7 +73,7 @@ def save(path: pathlib.Path, instance: Instance) -> None:
     steps: dict[str, Any] = {}
     for key in instance.film[0]:
         each = [step[key] for step in instance.film]
-        steps[key] = np.stack([_unpacked(one) for one in each] if key == "label" else each)
+        steps[key] = np.stack([unpacked(one) for one in each] if key == "label" else each)
     steps["shape"] = np.concatenate([steps["shape"], instance.scene.shape[None]])
     steps["poses"] = np.concatenate([steps["poses"], instance.poses[None]])
     scene = {key: getattr(instance.scene, key) for key in ("size", "color", "mass", "friction")}

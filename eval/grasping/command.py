@@ -45,7 +45,7 @@ def grasp(
       curve: runs of dipn-train grasp-online of different --seed, with and without --init.
       scenes_: number of tables.
       objects: number of objects on a table.
-      seed: random seed of scenes and random grasps; keep it away from the training data's.
+      seed: random seed of scenes and random grasps; the scenes are never those of training data.
       others: where a grasp missed, also try this many of the next best ones, to see what physics allows; they are
         ranked as the policy ranked them, from the same image and with the same memory of misses.
       aids: what no paper has, as of dipn-eval clear; memory: a grasp that missed is remembered until something near it

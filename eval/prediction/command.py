@@ -45,7 +45,7 @@ def predict(
       curve: runs of dipn-train push with different --limit and --seed.
       scenes_: number of pushes, one in each scene.
       objects: number of objects in a scene.
-      seed: random seed of scenes and pushes; keep it away from the training data's.
+      seed: random seed of scenes and pushes, which are never those of training data.
       engine: the engine whose result counts as the truth.
       threads: that native simulates on; one a core if not given.
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
