@@ -35,9 +35,9 @@ def list_runs(root: pathlib.Path) -> list[Run]:
     images = run("images", "dipn-datagen images --episodes 100")
     pretrained = run("pretrained", "dipn-train grasp-pretrain --steps 400 --data", images)
     _online(run, pretrained)
-    shipped = _shipped(run, pretrained)
-    run("builtin-10", "dipn-eval grasp --scenes 200 --others 16 --grasp-net", shipped)
-    run("builtin-30", "dipn-eval grasp --scenes 30 --objects 30 --others 16 --grasp-net", shipped)
+    _shipped(run, pretrained)
+    run("builtin-10", "dipn-eval grasp --scenes 200 --others 15 --grasp-net builtin")
+    run("builtin-30", "dipn-eval grasp --scenes 30 --objects 30 --others 15 --grasp-net builtin")
     _without_arches(run)
     return run.runs
 
@@ -50,7 +50,7 @@ def _online(run: Recipe, pretrained: pathlib.Path) -> None:
     run("online", "dipn-eval grasp --curve", learnt)
 
 
-def _shipped(run: Recipe, pretrained: pathlib.Path) -> pathlib.Path:
+def _shipped(run: Recipe, pretrained: pathlib.Path) -> None:
     """Add the runs of the shipped network: five data sets, the grasps of each chosen by the network before it."""
     train = "dipn-train grasp --batch 64 --data"
     first = run("first", "dipn-datagen grasp --actions 6 --objects 1:12 --episodes 12000 --grasp-net", pretrained)
@@ -73,7 +73,7 @@ def _shipped(run: Recipe, pretrained: pathlib.Path) -> pathlib.Path:
     packed = "3:9 --packed 0.8 --episodes 6000 --seed 9 --guided 0.7 --hard 0.25 --grasp-net"
     fifth = run("fifth", chosen, packed, fourfold)
     rates = "--steps 2200 --learning-rate 1e-3 --init"
-    return run("shipped", train, [first, second, third, fourth, fifth], rates, fourfold)
+    run("shipped", train, [first, second, third, fourth, fifth], rates, fourfold)
 
 
 def _without_arches(run: Recipe) -> None:
@@ -84,7 +84,7 @@ def _without_arches(run: Recipe) -> None:
     grasps = run("no-arches/grasps", chosen, pretrained)
     rates = "--steps 800 --learning-rate 2e-3 --init"
     network = run("no-arches/gn", "dipn-train grasp --batch 64 --data", grasps, rates, pretrained)
-    evaluate = "dipn-eval grasp --scenes 50 --items concave concave_slim --others 16 --grasp-net"
+    evaluate = "dipn-eval grasp --scenes 50 --items concave concave_slim --others 15 --grasp-net"
     run("unseen-concave", evaluate, network)
 
 
