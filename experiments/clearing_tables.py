@@ -97,12 +97,14 @@ def _compared(theirs: list[list[Table]], ours: list[list[Table]]) -> dict[str, A
     return values
 
 
-def _cell(values: dict[str, Any], at: str, *, spread: bool = False) -> str:
+def _cell(values: dict[str, Any], at: str) -> str:
+    """Return a share in per cent, with its interval, and its spread where there are several trainings."""
     if values.get(at) is None:
         return "-"
     value, low, high = (100 * values[f"{at}{end}"] for end in ("", "_low", "_high"))
-    trainings = f" ({100 * values[f'{at}_spread']:.1f})" if spread else ""
-    return f"{value:.1f} [{low:.0f}, {high:.0f}]{trainings}"
+    several = values.get(f"{at.rpartition('/')[0]}/trainings", 1) > 1
+    spread = f" ({100 * values[f'{at}_spread']:.1f})" if several else ""
+    return f"{value:.1f} [{low:.0f}, {high:.0f}]{spread}"
 
 
 def _difference(values: dict[str, Any], at: str) -> str:
@@ -113,14 +115,14 @@ def _difference(values: dict[str, Any], at: str) -> str:
     return f"{sure}{value:+.1f}{sure} [{low:+.1f}, {high:+.1f}]"
 
 
-def _table(values: dict[str, Any], head: str, rows: dict[str, str], *, spread: bool = False) -> str:
+def _table(values: dict[str, Any], head: str, rows: dict[str, str]) -> str:
     """Return a table of the groups `rows`, title by name, as far as they are there."""
     lines = [f"| {head} | tables | pushes | " + " | ".join(TITLES.values()) + " | efficiency, difference |"]
     lines.append("| --- " * (len(TITLES) + 4) + "|")
     for at, title in rows.items():
         if f"{at}/tables" in values:
             cells = [str(values[f"{at}/tables"]), str(values[f"{at}/pushes"])]
-            cells += [_cell(values, f"{at}/{key}", spread=spread) for key in TITLES]
+            cells += [_cell(values, f"{at}/{key}") for key in TITLES]
             lines.append(f"| {title} | {' | '.join(cells)} | {_difference(values, f'{at}/efficiency_all')} |")
     return "\n".join(lines) + "\n"
 
@@ -141,7 +143,7 @@ def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
     }
     if not any(f"{at}/tables" in values for at in rows):
         return ""
-    text = _table(values, f"{on}, {'all aids' if aids == 'all' else 'bare'}", rows, spread=True)
+    text = _table(values, f"{on}, {'all aids' if aids == 'all' else 'bare'}", rows)
     for method, published in paper.TABLE.get(on, {}).items() if aids == "bare" else ():
         found = dict(zip(paper.COLUMNS, published, strict=True))
         cells = [f"{found[key]:.1f}" if key in found else "" for key in TITLES]

@@ -14,9 +14,9 @@ from dipn_jax.structs import Array, Observation
 SURE_SCORE = 0.7
 """Score of an object's best grasp from which on no miss is expected; the paper's threshold to grasp at once."""
 MISSES_PER_SHORTFALL = 1 / 2.4
-"""Misses to be expected for an object that scores 0. Chosen on 34 tables (the hard ten at another seed, their first
-states with no grasp over SURE_SCORE) from each of which were simulated grasps alone and a push first: pushing where
-the shortfalls add up to 2.4 saved most (14 pushes saved 15 actions besides their own; pushing on all 34 saved 4)."""
+"""Misses to be expected for an object that scores 0. Chosen by `experiments/push_or_grasp.py` on the ten hard tables at
+a seed of their own: of the 34 states on which no grasp was over SURE_SCORE, a push saved most actions where the
+shortfalls add up to 2.4 (14 pushes, 15 actions fewer, their own counted; a push on all 34: 4 fewer)."""
 
 
 def misses_to_come(scorer: Scorer) -> Estimate:
