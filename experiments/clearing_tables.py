@@ -11,9 +11,12 @@ from dipn_jax.eval.clearing import lockstep, sweeping
 from dipn_jax.eval.report import paper
 
 from dipn_jax.names import ALL_AIDS
+from experiments import runs
 from experiments.kept import Kept, Table
 from experiments.runs import Run
 
+Trainings = dict[str, list[Table]]
+"""Tables that the trainings of one method cleared, by the seed of the training."""
 ABLATED = ALL_AIDS
 """Aids that are left out, and left alone, one after the other."""
 OURS = "dipn+gn"
@@ -32,14 +35,15 @@ TITLES = {
 def numbers(listed: Sequence[Run], kept: Kept) -> dict[str, Any]:
     """Return all numbers of the page by name; those of runs that are not kept are not there.
 
-    Of several trainings of one method there are the mean, `_spread` (the largest less the smallest), and the interval
-    over cases, then over repeats and trainings; `_less` is the difference from DIPN+GN on the same tables.
+    Of several trainings of one method there are the ratio over all their tables, `_spread` (the largest less the
+    smallest ratio), and the interval for these trainings, over cases, then over their tables; `_less` is the difference
+    from DIPN+GN on the same tables, of the trainings of the same seed.
     """
-    groups: dict[str, list[list[Table]]] = {}
-    for run in listed:
-        tables = kept.tables(run)
+    groups: dict[str, Trainings] = {}
+    for run, key in zip(listed, runs.keys(listed).values(), strict=True):
+        tables = kept.tables(run, key)
         if tables is not None:
-            groups.setdefault(_group(run.name), []).append(tables)
+            groups.setdefault(_group(run.name), {})[run.name.rpartition("/")[2]] = tables
     values: dict[str, Any] = {}
     for name, trainings in groups.items():
         values |= {f"{name}/{key}": value for key, value in _measured(trainings).items()}
@@ -65,12 +69,12 @@ def _rival(name: str) -> str:
     return f"table/heldout/shipped/all/{OURS}"
 
 
-def _measured(trainings: list[list[Table]]) -> dict[str, Any]:
-    every = [table for tables in trainings for table in tables]
+def _measured(trainings: Trainings) -> dict[str, Any]:
+    every = [table for tables in trainings.values() for table in tables]
     values: dict[str, Any] = {"tables": len(every), "trainings": len(trainings)}
     values["grasps"], values["pushes"] = (sum(getattr(one, kind) for one in every) for kind in ("grasps", "pushes"))
     cases = [table.name for table in every]
-    each = [lockstep.counts(tables) for tables in trainings]
+    each = [lockstep.counts(tables) for tables in trainings.values()]
     for key, (hits, trials) in lockstep.counts(every).items():
         value, low, high = metrics.ratio_interval(hits, trials, groups=cases)
         values |= {key: value, f"{key}_low": low, f"{key}_high": high}
@@ -83,9 +87,13 @@ def _measured(trainings: list[list[Table]]) -> dict[str, Any]:
     }
 
 
-def _compared(theirs: list[list[Table]], ours: list[list[Table]]) -> dict[str, Any]:
-    """Return differences from DIPN+GN, paired by training and table."""
-    pairs = [pair for one, other in zip(theirs, ours, strict=False) for pair in zip(one, other, strict=False)]
+def _compared(theirs: Trainings, ours: Trainings) -> dict[str, Any]:
+    """Return differences from DIPN+GN, paired by the seed of the training and by table; empty if no seed is in both."""
+    both = [seed for seed in theirs if seed in ours] if len(theirs) > 1 or len(ours) > 1 else None
+    sets = [(theirs[seed], ours[seed]) for seed in both] if both is not None else [(*theirs.values(), *ours.values())]
+    if not sets:
+        return {}
+    pairs = [pair for one, other in sets for pair in zip(one, other, strict=True)]
     if any(a.name != b.name for a, b in pairs):
         raise ValueError("tables of other cases, or in another order, cannot be compared")
     cases = [a.name for a, _ in pairs]
@@ -170,7 +178,7 @@ def section(values: dict[str, Any]) -> str:
         if f"masks/{on}/true/tables" in values:
             masks |= {shipped.format(on): f"{on}, found in the image", f"masks/{on}/true": f"{on}, the simulator's"}
     base = {shipped.format("heldout"): "as it is"}
-    aids = base | {"table/heldout/shipped/bare/dipn+gn": "without any aid"}
+    aids: dict[str, str] = {}
     for aid in ABLATED:
         aids |= {f"aids/without/{aid}": f"all but `{aid}`", f"aids/alone/{aid}": f"`{aid}` alone"}
     distance = {"distance/chosen": "3 to 12 cm, chosen for each push"}
@@ -181,7 +189,7 @@ def section(values: dict[str, Any]) -> str:
             "What each aid is worth",
             "aids, DIPN+GN on held-out tables",
             base,
-            {k: v for k, v in aids.items() if k not in base},
+            aids,
         ),
         ("Changed worlds", "random tables", {}, _named(values, "changed")),
         ("A distance for every push", "push, DIPN+GN on held-out tables", base, distance),

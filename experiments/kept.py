@@ -56,14 +56,17 @@ class Kept:
         rows = [[cases.index(one["name"]), ENDS.index(one["ended"]), *(one[key] for key in COUNTS)] for one in entries]
         stamp = runs.read_stamp(run)
         made = {key: stamp[key] for key in ("command", "made_by", "seed", "versions")}
-        self.found[run.name] = {"key": key, **made, "cases": cases, "rows": rows}
+        settings = files.read_json(run.out / "settings.json")
+        sources = {"networks": list(settings["networks"].values()), "code": settings["code"]}
+        self.found = files.read_json(self.path) if self.path.exists() else {}  # others may have written
+        self.found[run.name] = {"key": key, **made, **sources, "cases": cases, "rows": rows}
         _write(self.path, dict(sorted(self.found.items())))
 
-    def tables(self, run: Run) -> list[Table] | None:
-        """Return the tables of a run; None if they are not kept."""
-        found = self.found.get(run.name)
-        if found is None:
+    def tables(self, run: Run, key: str) -> list[Table] | None:
+        """Return the tables of a run; None if they are not kept, or were made by another command."""
+        if not self.has(run, key):
             return None
+        found = self.found[run.name]
         return [Table(found["cases"][row[0]], ENDS[row[1]], *row[2:]) for row in found["rows"]]
 
     def made(self, listed: Sequence[Run]) -> dict[str, Any]:

@@ -136,7 +136,7 @@ def score_image(
       action: grasps are scored by the `compact` network at half of the rotations, because a grasp turned by half a turn
         is the same grasp, and score 0 on empty table; pushes are scored at all rotations, and everywhere.
       squash: function from the network's outputs to scores.
-      table: whether grasps centred on empty table score 0; False: what the network says, which never learnt of any.
+      table: whether grasps centred on empty table score 0; False: what the network says, which never grasped there.
 
     Returns:
       Scores in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.

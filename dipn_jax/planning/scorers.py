@@ -17,7 +17,7 @@ from dipn_jax.planning.planner import Scorer, ScoreSummary
 from dipn_jax.storage import checkpoint
 
 TABLE_AID: tuple[Aid, ...] = ("table",)
-"""The one aid that the compared networks' grasps are learnt with."""
+"""The one aid that the compared networks choose grasps with while they learn."""
 
 
 def _frozen(model: nnx.Module) -> Callable[[], nnx.Module]:

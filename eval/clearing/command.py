@@ -44,7 +44,7 @@ def clear(
     baseline rea+dipn, dqn+gn and vpg:
       dipn-eval clear --method dqn+gn --value-net runs/dqn --grasp-net builtin --out results/dqn
 
-    Without any aid, that is, with scores and rule as published:
+    Without any aid, with scores as the network gives them and the rule as published:
       dipn-eval clear --push-net builtin --grasp-net builtin --aids --label bare --out results/bare
 
     Args:

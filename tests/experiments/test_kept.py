@@ -19,6 +19,7 @@ def _run(folder: pathlib.Path, name: str, entries: list[dict[str, Any]]) -> Run:
     """Return a run that has ended."""
     run = Run(name, folder / name, ("dipn-eval", "clear", "--out", str(folder / name)))
     files.write_json(run.out / "episodes.json", entries)
+    files.write_json(run.out / "settings.json", {"networks": {"builtin": {"digest": "abc"}}, "code": "def"})
     runs.write_stamp(run, "key", complete=True)
     return run
 
@@ -30,11 +31,13 @@ def test_what_is_kept_is_what_was_found(tmp_path: pathlib.Path) -> None:
     results.keep(run, "key")
     again = Kept(tmp_path / "kept.json")
     assert again.has(run, "key") and not again.has(run, "other")
-    tables = again.tables(run)
+    assert again.tables(run, "other") is None, "of another command"
+    assert again.found["a"]["networks"] == [{"digest": "abc"}] and again.found["a"]["code"] == "def"
+    tables = again.tables(run, "key")
     assert tables is not None and [table.name for table in tables] == ["01", "02", "01"]
     assert tables[1] == kept.Table("02", "pushed out", 5, 1, 1, 2, 3)
     assert again.made([run])["a"]["made_by"][-1]["cores"] >= 1
-    assert Kept(tmp_path / "none.json").tables(run) is None
+    assert Kept(tmp_path / "none.json").tables(run, "key") is None
 
 
 def test_only_what_is_missing_is_carried_out_and_what_that_needs(tmp_path: pathlib.Path) -> None:
@@ -64,8 +67,18 @@ def _kept(tmp_path: pathlib.Path, rows: dict[str, list[int]]) -> tuple[list[Run]
     for name, grasps in rows.items():
         entries = [ENTRY | {"name": f"0{i // 2}", "grasps": count, "pushes": 0} for i, count in enumerate(grasps)]
         listed.append(_run(tmp_path, name, entries))
-        results.keep(listed[-1], "key")
+        results.keep(listed[-1], runs.keys(listed[-1:])[name])
     return listed, results
+
+
+def test_trainings_are_paired_by_their_seed(tmp_path: pathlib.Path) -> None:
+    rows = {
+        "table/hard/paper/all/dipn+gn/1": [5, 5],
+        "table/hard/paper/all/gn/0": [50, 50],
+        "table/hard/paper/all/gn/1": [5, 5],
+    }
+    values = clearing_tables.numbers(*_kept(tmp_path, rows))
+    assert values["table/hard/paper/all/gn/efficiency_all_less"] == 0, "the first training was compared with the second"
 
 
 def test_numbers_of_several_trainings_and_differences(tmp_path: pathlib.Path) -> None:

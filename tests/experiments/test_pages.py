@@ -155,18 +155,20 @@ def test_the_page_of_grasping_is_written(docs: pathlib.Path) -> None:
     assert (docs / "grasping-reliability.png").read_bytes() == b"picture of reliability.png"
 
 
-def test_the_page_of_clearing_is_what_is_kept(docs: pathlib.Path) -> None:
+def test_the_page_of_clearing_is_what_is_kept(docs: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(docs.parent)
+    root = pathlib.Path("results")
     values, sweep = files.read_json(DOCS / "clearing.json"), files.read_json(DOCS / "sweep.json")
     for name in ("clearing-tables.json", "sweep.json"):
         shutil.copy(DOCS / name, docs)
-    clearing.write_page(docs.parent, docs=docs)
+    clearing.write_page(root, docs=docs)
     written = files.read_json(docs / "clearing.json")
     assert written.keys() == values.keys() and written[pages.MADE] == values[pages.MADE]
     for key in values.keys() - {pages.MADE}:
         assert written[key] == pytest.approx(values[key]), key
     assert (docs / "clearing.md").read_text() == (DOCS / "clearing.md").read_text()
-    _put(docs.parent / "clear" / "sweep", {**sweep, "other": 1}, "sweep.png")
-    clearing.write_page(docs.parent, docs=docs)
+    _put(root / "clear" / "sweep", {**sweep, "other": 1}, "sweep.png")
+    clearing.write_page(root, docs=docs)
     assert files.read_json(docs / "sweep.json") == sweep
 
 

@@ -64,7 +64,9 @@ class Script:
         return self.steps[self.done - 1][1]
 
 
-def _play(steps: list[tuple[str, Any]], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Instance:
+def _play(
+    steps: list[tuple[str, Any]], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, **options: Any
+) -> Instance:
     script = Script(steps)
     monkeypatch.setattr(lockstep.primitives, "push", script.push)
     monkeypatch.setattr(lockstep.clutter, "grasp_away", script.grasp_away)
@@ -73,7 +75,7 @@ def _play(steps: list[tuple[str, Any]], tmp_path: pathlib.Path, monkeypatch: pyt
     poses = np.array([[0, 0, 0.025, 1, 0, 0, 0], [0.1, 0, 0.025, 1, 0, 0, 0]], np.float32)
     table = Instance("one", scene, poses, OBJECTS)
     partial = Partial(tmp_path, {})
-    (ended,) = lockstep.clear([table], None, script.decide, partial, seed=0)  # type: ignore[arg-type]
+    (ended,) = lockstep.clear([table], None, script.decide, partial, seed=0, **options)  # type: ignore[arg-type]
     partial.finish()
     assert script.done == ended.actions == len(ended.film)
     return ended
@@ -122,3 +124,5 @@ def test_the_policy_is_told_of_misses_only_where_it_remembers(
     ended = _play([("grasp", ()), ("grasp", (0, 1))], tmp_path, monkeypatch)
     np.testing.assert_array_equal(ended.film[0]["missed"][0], planner.NONE_MISSED[0])
     np.testing.assert_array_equal(ended.film[1]["missed"][0], [0, 0, 0])
+    bare = _play([("grasp", ()), ("grasp", (0, 1))], tmp_path, monkeypatch, remember=False)
+    assert (bare.film[1]["missed"] == -1).all()

@@ -14,7 +14,7 @@ from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.grasping import success
 
 from dipn_jax import geometry, structs
-from dipn_jax.planning import scorers
+from dipn_jax.planning import planner, scorers
 from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import ABSENT, Array, Fault, Grasp, Rollout, Scene, SettledScene, Trajectory
 from dipn_jax.workspace import GRIPPER
@@ -61,7 +61,8 @@ def _table(did: list[str], place: str, *, friction: float = 0.5, mass: float = 0
     scene = Scene(np.full(1, ABSENT, np.int32), size, color, mass * one, friction * one)
     center = geometry.pixels_to_metres(jnp.array(PEAKS[place][::-1]))
     poses = np.array([[*center, 0.02, 1, 0, 0, 0]], np.float32)
-    film = [{"shape": np.zeros(1, np.int32), "poses": poses, "values": np.array([0.9, 0, 0])} for _ in did]
+    known = {"shape": np.zeros(1, np.int32), "poses": poses, "missed": planner.NONE_MISSED}
+    film = [known | {"values": np.array([0.9, 0, 0])} for _ in did]
     return Instance("x", scene, poses + 1, 1, did=did, film=film)
 
 
@@ -81,6 +82,14 @@ def test_the_ceiling_counts_the_misses_that_a_next_best_grasp_would_have_held() 
     one = success._other_grasps(peaks, Lifts(), tables, 1)  # type: ignore[arg-type]
     assert one["other_grasps/one_holds"] == pytest.approx(1 / 7)
     assert one["other_grasps/ceiling"] == pytest.approx(1 - 6 / 10)
+
+
+def test_other_grasps_are_ranked_with_the_misses_that_the_policy_knew() -> None:
+    table = _table(["grasp missed"], "third")
+    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 0  # type: ignore[arg-type]
+    row, col = PEAKS["second"]  # 0.8 is halved: the third is now the next best
+    table.film[0]["missed"] = np.array([[0, row, col]], np.int32)
+    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 1  # type: ignore[arg-type]
 
 
 def test_without_a_miss_there_is_no_ceiling() -> None:
@@ -130,7 +139,7 @@ def test_the_rates_are_of_all_grasps_and_of_the_first(monkeypatch: pytest.Monkey
     monkeypatch.setattr(instances, "random_instances", lambda *_, **__: tables)
     monkeypatch.setattr(lockstep, "clear", lambda *_, **__: tables)
     monkeypatch.setattr(success, "_random_foreground", lambda *_: {})
-    monkeypatch.setattr(on_tables, "in_lockstep", lambda policy: policy)
+    monkeypatch.setattr(on_tables, "in_lockstep", lambda policy, camera: policy)
     found, _ = success.evaluate(peaks, Lifts(), scenes.fixed_count(1), None, scenes=4, seed=0)  # type: ignore[arg-type]
     assert found["grasp_success/gn"] == pytest.approx(5 / 9)
     assert found["grasp_success/gn_first"] == pytest.approx(2 / 4)
