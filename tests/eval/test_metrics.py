@@ -1,3 +1,5 @@
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from dipn_jax.eval import metrics
@@ -47,3 +49,58 @@ def test_a_difference_is_paired_by_table(rng: np.random.Generator) -> None:
     value, low, high = metrics.ratio_difference((hard + noise, ones), (hard, ones), cases)
     assert low < value < high and value == pytest.approx(noise.mean())
     assert np.isnan(metrics.ratio_difference((ours, ones), (theirs, np.zeros(100)), cases)[0])
+
+
+def _resampled(groups: Sequence[str], seed: int) -> list[list[int]]:
+    """Return the tables of 2000 two-stage resamples, drawn by loops: groups, and then the tables of each."""
+    rng = np.random.default_rng(seed)
+    members = [[i for i, name in enumerate(groups) if name == group] for group in sorted(set(groups))]
+    most = max(map(len, members))
+    chosen = rng.integers(0, len(members), (2000, len(members)))
+    uniform = rng.uniform(size=(2000, len(members), most))
+    rows = []
+    for which, numbers in zip(chosen, uniform, strict=True):
+        drawn = [members[group] for group in which]
+        rows.append(
+            [own[int(u * len(own))] for own, each in zip(drawn, numbers, strict=True) for u in each[: len(own)]]
+        )
+    return rows
+
+
+GROUPS = ["b", "a", "b", "c", "b", "a"]
+"""Cases of unequal size, in no order."""
+HITS, TRIALS = np.array([0.9, 0, 2.3, 0.2, 0.1, 0]), np.array([1.0, 0, 3, 1, 1, 0])
+OTHERS, TRIED = np.array([0.4, 0.8, 0.7, 0, 0, 0]), np.array([2.0, 1, 1, 0, 0, 0])
+"""Hits and trials of two methods: some resamples have no trial of one of them or of both, and some a single one."""
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("groups", [GROUPS, None])
+def test_resamples_are_those_of_a_loop(groups: list[str] | None, seed: int) -> None:
+    rows = _resampled(groups or list("abcdef"), seed)
+    found = metrics._resamples(6, groups, seed)
+    assert [[i for i in row if i >= 0] for row in found.tolist()] == rows
+    assert found.min() == (-1 if groups else 0)
+    values = [HITS[row].sum() / TRIALS[row].sum() for row in rows if TRIALS[row].sum()]
+    chosen = {"groups": groups, **({"seed": seed} if seed else {})}
+    value, *ends = metrics.ratio_interval(HITS, TRIALS, **chosen)
+    assert value == HITS.sum() / TRIALS.sum() and ends == pytest.approx(np.percentile(values, [2.5, 97.5]), rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_a_difference_is_that_of_a_loop(seed: int) -> None:
+    rows = [row for row in _resampled(GROUPS, seed) if TRIALS[row].sum() and TRIED[row].sum()]
+    values = [HITS[row].sum() / TRIALS[row].sum() - OTHERS[row].sum() / TRIED[row].sum() for row in rows]
+    options = {"seed": seed} if seed else {}
+    value, *ends = metrics.ratio_difference((HITS, TRIALS), (OTHERS, TRIED), GROUPS, **options)
+    assert value == pytest.approx(HITS.sum() / TRIALS.sum() - OTHERS.sum() / TRIED.sum())
+    assert ends == pytest.approx(np.percentile(values, [2.5, 97.5]), rel=1e-12)
+
+
+def test_one_trial_is_enough_and_none_is_too_few() -> None:
+    one, none = np.array([1.0, 0.0]), np.zeros(2)
+    assert metrics.ratio_interval(one, one) == (1.0, 1.0, 1.0)
+    assert metrics.ratio_difference((one, one), (none, one), ["a", "a"]) == (1.0, 1.0, 1.0)
+    for ours, theirs in (((one, none), (one, one)), ((one, one), (one, none)), ((one, none), (one, none))):
+        assert np.isnan(metrics.ratio_difference(ours, theirs, ["a", "a"])).all()
+    assert np.isnan(metrics.ratio_interval(one, none)).all()

@@ -1,5 +1,6 @@
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from dipn_jax.networks import losses
 
@@ -29,6 +30,38 @@ def test_mask_errors_of_known_squares() -> None:
     np.testing.assert_allclose(xor, [100 / 200, 0.0])
 
 
-def test_moved_is_by_distance_or_angle() -> None:
-    motion = jnp.array([[0.002, 0.0, 0.0], [0.004, 0.0, 0.0], [0.0, 0.0, 0.1]])
-    assert losses.moved(motion).tolist() == [False, True, True]
+def test_mask_errors_of_single_pixels_and_of_empty_masks() -> None:
+    true = jnp.full((4, 6), -1).at[0, 0].set(0)
+    predicted = true.at[2:4, 3:6].set(1)  # the second is predicted where there is none, the third nowhere
+    iou, xor = losses.mask_errors(predicted, true, 3)
+    np.testing.assert_allclose(iou, [0, 1, 0])
+    np.testing.assert_allclose(xor, [0, 1, 0])
+    iou, xor = losses.mask_errors(true, predicted, 3)  # the second is not predicted
+    np.testing.assert_allclose(iou, [0, 1, 0])
+    np.testing.assert_allclose(xor, [0, 0.5, 0])
+
+
+def test_a_mean_over_few_or_none() -> None:
+    predicted, target = jnp.array([[3.0, 0.0, 0.0], [9.0, 9.0, 9.0]]), jnp.zeros((2, 3))
+    assert losses.motion_loss(predicted, target, jnp.array([True, False])) == 2.5
+    assert losses.motion_loss(predicted, target, jnp.zeros(2, bool)) == 0
+    logits, target, half = jnp.zeros(2), jnp.ones(2), jnp.array([0.5, 0.0])
+    assert losses.score_loss(logits, target, half) == pytest.approx(np.log(2))
+    assert losses.score_loss(logits, target, jnp.zeros(2)) == 0
+
+
+def test_the_loss_is_in_pixels_and_degrees() -> None:
+    np.testing.assert_allclose(np.array([0.002, 0.004, np.pi]) * losses.PIXELS_DEGREES, [1, 2, 180], rtol=1e-6)
+
+
+def test_moved_is_over_3_mm_or_3_degrees() -> None:
+    motion = np.zeros((2, 5, 3), np.float32)
+    motion[0, :, 0] = [0.0029, 0.0031, -0.0031, 0.0, 0.0022]
+    motion[0, :, 1] = [0.0, 0.0, 0.0, 0.0031, 0.0022]
+    motion[1, :, 2] = np.deg2rad([2.9, 3.1, -3.1, -2.9, 3.0])
+    got = losses.moved(jnp.array(motion))
+    assert got.tolist() == [[False, True, True, True, True], [False, True, True, False, False]]
+
+
+def test_a_small_turn_is_no_distance() -> None:
+    assert not losses.moved(jnp.array([0.002, 0.0, 0.05]))

@@ -1,6 +1,5 @@
 from typing import Any
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,29 +7,13 @@ import pytest
 
 from dipn_jax import geometry, structs
 from dipn_jax.planning import candidates
-from dipn_jax.sight import fingers, masks, render
+from dipn_jax.sight import fingers, render
 from dipn_jax.structs import ABSENT, Observation
 from dipn_jax.workspace import GRIPPER
 
 
 def _seen(settled: Any, index: int = 0) -> Observation:
     return render.render(structs.take(settled.scene, index), settled.poses[index])
-
-
-def test_contour_is_opencvs(settled: Any) -> None:
-    mask = np.asarray(_seen(settled).label) != ABSENT
-    eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    np.testing.assert_array_equal(masks.contour(jnp.array(mask)), mask & (eroded == 0))
-
-
-def test_centroids_are_opencvs(settled: Any) -> None:
-    label = np.asarray(_seen(settled).label)
-    centers, area = masks.mask_centers(jnp.array(label), 5)
-    for i in range(5):
-        moments = cv2.moments((label == i).astype(np.uint8), binaryImage=True)
-        assert area[i] == moments["m00"]
-        want = np.array([moments["m10"], moments["m01"]]) / max(moments["m00"], 1)
-        np.testing.assert_allclose(geometry.metres_to_pixels(centers[i]), want, atol=1e-2)
 
 
 def test_feasible_pushes_start_free_inside_and_aim_at_an_object(settled: Any) -> None:

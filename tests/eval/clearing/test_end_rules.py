@@ -10,9 +10,10 @@ import pytest
 from dipn_jax.eval.clearing import lockstep
 from dipn_jax.eval.clearing.instances import Instance
 
+from dipn_jax import files
 from dipn_jax.planning import planner
 from dipn_jax.storage.resume import Partial
-from dipn_jax.structs import Decision, Fault, Grasp, Push, Scene
+from dipn_jax.structs import ABSENT, Decision, Fault, Grasp, Push, Scene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import scenes
 
@@ -25,6 +26,7 @@ class Script:
 
     steps: list[tuple[str, Any]]
     done: int = 0
+    longest: float = 0.0
 
     def decide(self, keys: jax.Array, scene: Scene, poses: np.ndarray, missed: np.ndarray) -> Any:
         """Push or grasp as the script says."""
@@ -48,7 +50,8 @@ class Script:
         if not isinstance(what, Fault):
             after[0, 0, 0] = what
         fault = np.array([what if isinstance(what, Fault) else 0])
-        return type("Rollout", (), {"poses": after[:, None], "fault": fault})
+        self.longest = longest
+        return type("Rollout", (), {"poses": np.stack([poses, poses, after], 1), "fault": fault})
 
     def grasp_away(self, engine: Any, scene: Scene, poses: np.ndarray, grasp: Grasp) -> Any:
         """Hold the objects that the script names, or fail."""
@@ -64,6 +67,24 @@ class Script:
         return self.steps[self.done - 1][1]
 
 
+class Shown:
+    """Stands for `console.Progress`: what the user was told."""
+
+    def __init__(self, title: str, total: int, *, unit: str, done: int = 0) -> None:
+        self.total, self.done, self.notes = total, done, list[str]()
+
+    def __enter__(self) -> "Shown":
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        assert self.done <= self.total
+
+    def advance(self, amount: int, note: str = "") -> None:
+        """Count what is done, and keep the note."""
+        self.done += amount
+        self.notes.append(note)
+
+
 def _play(
     steps: list[tuple[str, Any]], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, **options: Any
 ) -> Instance:
@@ -75,9 +96,14 @@ def _play(
     poses = np.array([[0, 0, 0.025, 1, 0, 0, 0], [0.1, 0, 0.025, 1, 0, 0, 0]], np.float32)
     table = Instance("one", scene, poses, OBJECTS)
     partial = Partial(tmp_path, {})
+    shown = Shown("", OBJECTS, unit="objects")
+    monkeypatch.setattr(lockstep.console, "Progress", lambda *_, done, **__: shown)
     (ended,) = lockstep.clear([table], None, script.decide, partial, seed=0, **options)  # type: ignore[arg-type]
     partial.finish()
     assert script.done == ended.actions == len(ended.film)
+    assert script.longest in (0.0, 0.1), "the longest push of a data set, unless told otherwise"
+    assert shown.done == ended.removed and shown.notes[-1] == "1/1 tables ended" and len(shown.notes) == ended.actions
+    assert all(note == "0/1 tables ended" for note in shown.notes[:-1])
     return ended
 
 
@@ -116,6 +142,17 @@ def test_a_table_ends_after_three_actions_an_object(tmp_path: pathlib.Path, monk
     assert (ended.ended, ended.actions) == ("out of actions", 3 * OBJECTS)
     last = _play([("grasp", ())] * 5 + [("grasp", (0, 1))], tmp_path, monkeypatch)
     assert last.ended == "cleared", "the last action counts"
+
+
+def test_every_action_is_recorded_and_saved(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = _play([("grasp", (0,)), ("push", 0.05), ("grasp", (1,))], tmp_path / "work", monkeypatch)
+    assert [step["shape"].tolist() for step in ended.film] == [[0, 0], [ABSENT, 0], [ABSENT, 0]]
+    assert [step["poses"][1, 0] for step in ended.film] == pytest.approx([0.1, 0.1, 0.1])
+    lockstep.save([ended, ended], tmp_path)
+    listed = files.read_json(tmp_path / "episodes.json", wanted=list)
+    counted = {"objects": 2, "removed": 2, "held": 2, "grasps": 2, "pushes": 1}
+    assert listed[1] == {"name": "one", "file": "episodes/001.npz", "ended": "cleared", **counted}
+    assert all((tmp_path / line["file"]).is_file() for line in listed) and len(listed) == 2
 
 
 def test_the_policy_is_told_of_misses_only_where_it_remembers(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dipn_jax.eval.clearing import film, instances, lockstep
+from dipn_jax.eval.clearing import film
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
@@ -14,27 +14,6 @@ from dipn_jax.planning import candidates
 from dipn_jax.sight import render
 from dipn_jax.structs import Push, Scene
 from dipn_jax.world import clutter, primitives
-
-
-def _ended(name: str, steps: list[str], removed: int, objects: int) -> instances.Instance:
-    instance = instances.Instance("x", None, np.zeros((1, 7)), objects)  # type: ignore[arg-type]
-    instance.ended, instance.removed = name, removed
-    instance.did = steps
-    instance.pushes, instance.held = steps.count("push"), steps.count("grasp held")
-    instance.grasps = len(steps) - instance.pushes
-    return instance
-
-
-def test_summary_counts_as_the_paper_does() -> None:
-    rows = [
-        _ended("cleared", ["push", "grasp held", "grasp missed", "grasp held"], 2, 2),
-        _ended("pushed out", ["grasp held", "push"], 1, 3),
-    ]
-    values = lockstep.summary(rows)
-    assert values["completion"] == 0.5
-    assert values["grasp_success_all"] == 3 / 4 and values["grasp_success_completed"] == 2 / 3
-    assert values["efficiency_all"] == 3 / 6 and values["efficiency_completed"] == 2 / 4
-    assert values["grasps_that_held"] == 3 / 4 and values["pushes"] == 2 and values["ended_pushed_out"] == 1
 
 
 def test_every_table_ends_by_the_rules(cleared: Any, tmp_path: pathlib.Path) -> None:
