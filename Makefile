@@ -1,13 +1,14 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html
 # make test   lint, types, tests
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
+# make mutants  the table of docs/testing.md (hours)
 # make push-figures, make grasp-figures, make clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
 PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
-.PHONY: setup demo test lint bench push-figures grasp-figures clear-figures clean-demo
+.PHONY: setup demo test lint bench mutants push-figures grasp-figures clear-figures clean-demo
 
 setup: .venv/.installed
 
@@ -33,6 +34,7 @@ demo: setup ; $(BIN)/python -m experiments.demo
 push-figures: setup ; $(BIN)/python -m experiments.push_prediction
 grasp-figures: setup ; $(BIN)/python -m experiments.grasping
 clear-figures: setup ; $(BIN)/python -m experiments.clearing
+mutants: setup ; $(INSTALL) '.[dev,mutants]' && $(BIN)/python -m experiments.mutants
 
 clean-demo:
 	rm -rf demo

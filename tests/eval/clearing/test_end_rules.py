@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.eval.clearing import lockstep
+from dipn_jax.eval.clearing import film, lockstep
 from dipn_jax.eval.clearing.instances import Instance
 
 from dipn_jax import files
@@ -163,3 +163,15 @@ def test_the_policy_is_told_of_misses_only_where_it_remembers(
     np.testing.assert_array_equal(ended.film[1]["missed"][0], [0, 0, 0])
     bare = _play([("grasp", ()), ("grasp", (0, 1))], tmp_path, monkeypatch, remember=False)
     assert (bare.film[1]["missed"] == -1).all()
+
+
+def test_every_step_of_a_table_is_saved_as_it_was(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = _play([("grasp", (0,)), ("push", 0.05), ("grasp", (1,))], tmp_path, monkeypatch)
+    lockstep.save([ended], tmp_path)
+    (entry,) = files.read_json(tmp_path / "episodes.json", wanted=list)
+    assert entry["file"] == "episodes/000.npz" and (entry["held"], entry["pushes"]) == (2, 1)
+    reel = film.load(tmp_path / entry["file"])
+    np.testing.assert_array_equal(reel.shape, [[0, 0], [-1, 0], [-1, 0], [-1, -1]])
+    np.testing.assert_allclose(reel.poses[0, :, 0], [0, 0.1])
+    np.testing.assert_allclose(reel.poses[2, 0, 0], 0.05)
+    assert reel.what.tolist() == ["grasp held", "push", "grasp held"]

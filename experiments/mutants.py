@@ -1,0 +1,119 @@
+"""Mutation testing: change the code that computes numbers, one operator at a time, and see whether a test fails.
+
+    python -m experiments.mutants                                # all modules: hours on 2 cores
+    python -m experiments.mutants --only eval/metrics.py         # one: minutes
+    python -m experiments.mutants --list                         # modules, and the tests of each
+
+Cosmic Ray (the extra `mutants`) makes the mutants, in a scratch copy of this checkout. Interrupted, the same command
+continues. `docs/testing.json` and the table of `docs/testing.md` have the result of every module that is complete.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from dipn_jax import console, files
+from dipn_jax.errors import UserError
+from experiments import mutants_session, pages
+
+TESTS: dict[str, tuple[str, ...]] = {
+    "eval/metrics.py": ("tests/eval/test_metrics.py", "tests/eval/test_known_numbers.py"),
+    "eval/clearing/lockstep.py": ("tests/eval/clearing/test_end_rules.py", "tests/eval/clearing/test_counts.py"),
+    "dipn_jax/networks/losses.py": ("tests/dipn_jax/networks/test_losses.py",),
+    "train/split.py": ("tests/train/test_split.py",),
+    "dipn_jax/sight/masks.py": ("tests/dipn_jax/sight/test_masks.py",),
+    "dipn_jax/sight/imagine.py": ("tests/dipn_jax/sight/test_imagine.py",),
+    "dipn_jax/planning/planner.py": ("tests/dipn_jax/planning/test_planner.py",),
+    "dipn_jax/planning/candidates.py": ("tests/dipn_jax/planning/test_candidates.py",),
+    "dipn_jax/planning/outlook.py": ("tests/dipn_jax/planning/test_outlook.py",),
+    "dipn_jax/storage/records.py": ("tests/dipn_jax/storage/test_records.py",),
+    "dipn_jax/world/scenes.py": ("tests/dipn_jax/world/test_scenes.py",),
+    "eval/curves.py": ("tests/eval/test_known_numbers.py", "tests/eval/test_curves.py"),
+    "eval/prediction/push_errors.py": (
+        "tests/eval/test_known_numbers.py",
+        "tests/eval/prediction/test_push_errors.py",
+    ),
+    "eval/prediction/pushes.py": ("tests/eval/prediction/test_pushes.py",),
+    "eval/grasping/success.py": ("tests/eval/grasping/test_success.py",),
+    "eval/clearing/instances.py": ("tests/eval/clearing/test_instances.py", "tests/eval/clearing/test_lockstep.py"),
+    "eval/clearing/camera.py": ("tests/eval/clearing/test_camera.py",),
+    "eval/clearing/rollouts.py": ("tests/eval/clearing/test_rollouts.py",),
+    "eval/clearing/sweeping.py": ("tests/eval/clearing/test_sweeping.py",),
+    "eval/clearing/evaluation.py": ("tests/eval/clearing/test_command.py",),
+    "eval/clearing/tables.py": ("tests/eval/clearing/test_command.py",),
+    "eval/clearing/on_tables.py": ("tests/eval/clearing/test_command.py",),
+    "eval/report/comparison.py": ("tests/eval/report/test_comparison.py", "tests/eval/report/test_causes.py"),
+    "experiments/clearing_tables.py": ("tests/experiments/test_pages.py",),
+}
+"""Module that computes a number in a table -> the tests that its mutants are held against, the fastest first."""
+
+PAGE = "testing"
+"""Name of the page in docs and of its JSON."""
+_HEADING = "| module | mutants | killed | survivors |\n| --- | --- | --- | --- |\n"
+
+
+def table(values: dict[str, Any]) -> str:
+    """Return the table of the page as Markdown.
+
+    Args:
+      values: module -> its `mutants_session.result`; a module that is missing was not run.
+    """
+    rows = []
+    for module in TESTS:
+        if found := values.get(module):
+            share = 100 * found["killed"] / max(found["mutants"], 1)
+            cells = [str(found["mutants"]), f"{found['killed']} ({share:.1f} %)", str(len(found["survivors"]))]
+        else:
+            cells = ["not run", "", ""]
+        rows.append(f"| `{module}` | {' | '.join(cells)} |\n")
+    return _HEADING + "".join(rows)
+
+
+def write_page(values: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
+    """Write `testing.json`, and its table into `testing.md`."""
+    page = docs / f"{PAGE}.md"
+    files.write_json(docs / f"{PAGE}.json", values)
+    files.write_text(page, pages.with_table(files.read_text(page), table(values)))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.mutants",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--list", action="store_true", help="show the modules and the tests of each")
+    parser.add_argument("--dry-run", action="store_true", help="show the command that would be run on each mutant")
+    parser.add_argument("--only", nargs="+", default=[], metavar="MODULE", help="these modules")
+    parser.add_argument(
+        "--out", type=pathlib.Path, default=pathlib.Path("results/mutants"), metavar="FOLDER", help="of the sessions"
+    )
+    options = parser.parse_args(arguments)
+    return console.exit_code(lambda: _work(options))
+
+
+def _work(options: argparse.Namespace) -> int:
+    if unknown := sorted(set(options.only) - set(TESTS)):
+        raise UserError(f"no module {unknown[0]!r} in the list; want one of those that --list shows")
+    chosen = [module for module in TESTS if not options.only or module in options.only]
+    for module in chosen:
+        if options.list:
+            console.say(f"{module}\n  {' '.join(TESTS[module])}")
+        elif options.dry_run:
+            console.say(f"{module}: {mutants_session.test_command(TESTS[module])}")
+        else:
+            console.require_out(options.out)
+            found = mutants_session.run(module, TESTS[module], options.out.resolve())
+            kept = pages.DOCS / f"{PAGE}.json"
+            write_page({**(files.read_json(kept) if kept.exists() else {}), module: found})
+            console.say(f"{module}: {found['killed']} of {found['mutants']} killed")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
