@@ -106,7 +106,7 @@ def test_a_checkpoint_of_another_architecture(call, tmp_path: pathlib.Path) -> N
 
 def test_numbers_out_of_range(call, tmp_path: pathlib.Path) -> None:
     clear = ("eval", "clear", "--grasp-net", tmp_path, "--out", tmp_path / "e")
-    for option, value in (("--distance", "5"), ("--gamma", "nan"), ("--candidates", "0"), ("--seed", "-1")):
+    for option, value in (("--distances", "5"), ("--gamma", "nan"), ("--candidates", "0"), ("--seed", "-1")):
         _one_line(call(*clear, option, value), option)
     _one_line(call("datagen", "push", "--out", tmp_path / "d", "--actions", "100000"), "--actions")
     _one_line(call("datagen", "push", "--out", tmp_path / "d", "--objects", "0"), "--objects")
