@@ -39,6 +39,9 @@ def test_mask_errors_of_single_pixels_and_of_empty_masks() -> None:
     iou, xor = losses.mask_errors(true, predicted, 3)  # the second is not predicted
     np.testing.assert_allclose(iou, [0, 1, 0])
     np.testing.assert_allclose(xor, [0, 0.5, 0])
+    elsewhere = jnp.full((4, 6), -1).at[3, 4:6].set(0)  # two pixels for the one of the first
+    iou, xor = losses.mask_errors(elsewhere, true, 1)
+    assert (iou[0], xor[0]) == (1, 1.5)
 
 
 def test_a_mean_over_few_or_none() -> None:
