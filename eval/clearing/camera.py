@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from dipn_jax.errors import UserError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from dipn_jax.structs import Array, Observation, Scene
 
 HOLE_RADII = (1, 2, 3, 4)
@@ -53,6 +53,7 @@ class Camera:
           Observations `[B]`, NumPy. Found masks are numbered by size, not as the objects of the scene.
         """
         import jax
+        import numpy as np
 
         from dipn_jax.sight import render, segment
 
@@ -73,6 +74,8 @@ class Camera:
         self, rng: np.random.Generator, height: np.ndarray, color: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return height and colour of one image with noise."""
+        import numpy as np
+
         height = height + rng.normal(0, self.height_noise, height.shape)
         color = np.clip(color + rng.normal(0, self.image_noise, color.shape), 0, 1)
         return filled(height, spots(rng, height.shape, self.holes)).astype(np.float32), color.astype(np.float32)
@@ -81,6 +84,7 @@ class Camera:
 def spots(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> np.ndarray:
     """Return random round spots `[H, W]` bool that cover about `share` of the pixels."""
     import cv2
+    import numpy as np
 
     drawn = np.zeros(shape, np.uint8)
     area = np.mean([np.pi * radius**2 for radius in HOLE_RADII])

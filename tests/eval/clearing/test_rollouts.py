@@ -13,6 +13,7 @@ from dipn_jax.eval.clearing import rollouts
 from dipn_jax import structs
 from dipn_jax.planning import planner
 from dipn_jax.planning.planner import Rule
+from dipn_jax.sight import render
 from dipn_jax.structs import Array, Decision, Fault, Rollout, Scene, SettledScene, Trajectory
 from dipn_jax.world import shapes
 
@@ -57,7 +58,7 @@ def tables(settled: SettledScene) -> SettledScene:
 
 
 def _decide(tables: SettledScene, engine: Records) -> Decision:
-    return rollouts.decide(
+    decision, label = rollouts.decide(
         jax.random.split(jax.random.key(0), 3),
         tables.scene,
         tables.poses,
@@ -68,6 +69,8 @@ def _decide(tables: SettledScene, engine: Records) -> Decision:
         rule=PUSH_ALWAYS,
         distances=np.full(3, 0.1, np.float32),
     )
+    np.testing.assert_array_equal(label, render.observe(tables.scene, tables.poses).label)
+    return decision
 
 
 def test_the_engine_is_not_told_masses_and_frictions(tables: SettledScene) -> None:

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from dipn_jax.eval import metrics
-from dipn_jax.eval.clearing import lockstep
+from dipn_jax.eval.clearing import film, lockstep
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.report import comparison
 
@@ -28,6 +28,7 @@ def _table(name: str, did: list[str], ended: str) -> Instance:
     scene = Scene(np.zeros(1, np.int32), three, three, one, one)
     step = {"shape": scene.shape, "poses": np.zeros((1, 7)), "motion": np.zeros((1, 3))}
     step |= {"push": np.zeros(4), "grasp": np.zeros(3), "values": np.zeros(3)}
+    step |= {"label": film.packed(np.full((224, 224), -1)), "missed": np.full((8, 3), -1)}
     return Instance(name, scene, np.zeros((1, 7)), 1, ended=ended, did=did, film=[step] * len(did))
 
 
