@@ -12,10 +12,10 @@ from dipn_jax.eval.report import paper
 
 from dipn_jax.names import ALL_AIDS
 from experiments import runs
-from experiments.kept import Kept, Table
+from experiments.kept import Kept
 from experiments.runs import Run
 
-Trainings = dict[str, list[Table]]
+Trainings = dict[str, list[lockstep.Outcome]]
 """Tables that the trainings of one method cleared, by the seed of the training."""
 ABLATED = ALL_AIDS
 """Aids that are left out, and left alone, one after the other."""
@@ -161,7 +161,7 @@ def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
 
 SECTIONS = {
     "heldout": "Held-out hard tables: nothing was chosen by them",
-    "hard": "The ten hard tables of the paper, by which the aids were chosen",
+    "hard": "The ten hard tables of the paper, by which aids and constants were chosen",
     "random-10": "10 objects, dropped at random",
     "random-30": "30 objects, dropped at random",
 }

@@ -1,16 +1,17 @@
 """Results of complete evaluations, table by table, in one file of the repository.
 
 An experiment of a day is done in pieces, on machines that do not keep their folders: what an evaluation found is kept
-here, so that it need not be repeated, and whoever doubts an interval can draw it again.
+here, so that it need not be repeated, and so that a reader can compute every interval again.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
+
+from dipn_jax.eval.clearing.lockstep import Outcome
 
 from dipn_jax import files
 from experiments import runs
@@ -20,19 +21,6 @@ COUNTS = ("objects", "removed", "held", "grasps", "pushes")
 """What is kept of each table, after its case and how it ended."""
 ENDS = ("cleared", "pushed out", "out of actions", "fault")
 """How a table can end; kept as the number in this list."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Table:
-    """What is known of one table that has ended."""
-
-    name: str
-    ended: str
-    objects: int
-    removed: int
-    held: int
-    grasps: int
-    pushes: int
 
 
 class Kept:
@@ -62,12 +50,12 @@ class Kept:
         self.found[run.name] = {"key": key, **made, **sources, "cases": cases, "rows": rows}
         _write(self.path, dict(sorted(self.found.items())))
 
-    def tables(self, run: Run, key: str) -> list[Table] | None:
+    def tables(self, run: Run, key: str) -> list[Outcome] | None:
         """Return the tables of a run; None if they are not kept, or were made by another command."""
         if not self.has(run, key):
             return None
         found = self.found[run.name]
-        return [Table(found["cases"][row[0]], ENDS[row[1]], *row[2:]) for row in found["rows"]]
+        return [Outcome(found["cases"][row[0]], ENDS[row[1]], *row[2:]) for row in found["rows"]]
 
     def made(self, listed: Sequence[Run]) -> dict[str, Any]:
         """Return how the kept runs among `listed` were made, as `pages.made` does."""

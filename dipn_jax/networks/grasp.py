@@ -186,7 +186,7 @@ def aided_scores(
 
 
 def _mirrored(score: Callable[[jax.Array], jax.Array], image: jax.Array, axes: tuple[int, ...]) -> jax.Array:
-    """Return the scores of the image mirrored along `axes`, each in the place of the grasp that it mirrors."""
+    """Return the scores of the image mirrored along `axes`, each at the grasp that it mirrors."""
     scores = jnp.flip(score(jnp.flip(image, axes)), [axis + 1 for axis in axes])
     return scores[-np.arange(ROTATIONS) % ROTATIONS] if len(axes) == 1 else scores
 

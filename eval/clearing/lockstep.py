@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import pathlib
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -164,9 +165,11 @@ def _ended(instance: Instance) -> str:
     return "out of actions" if instance.actions >= ACTIONS_PER_OBJECT * instance.objects else ""
 
 
-class Counted(Protocol):
-    """What is counted of a table that has ended."""
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What is counted of a table that has ended; an Instance has the same fields."""
 
+    name: str
     ended: str
     objects: int
     removed: int
@@ -175,7 +178,7 @@ class Counted(Protocol):
     pushes: int
 
 
-def counts(tables: Sequence[Counted]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def counts(tables: Sequence[Outcome] | Sequence[Instance]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return hits and trials of each table `[I]` by measure; a measure is the sum of its hits over that of its trials.
 
     `grasp_success` counts objects and may pass 1, because a grasp may lift two; `grasps_that_held` counts grasps.

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from dipn_jax.eval import metrics
+from dipn_jax.eval.clearing import lockstep
 
 from dipn_jax import files
 from experiments import clearing_tables, kept, runs
@@ -35,7 +36,7 @@ def test_what_is_kept_is_what_was_found(tmp_path: pathlib.Path) -> None:
     assert again.found["a"]["networks"] == [{"digest": "abc"}] and again.found["a"]["code"] == "def"
     tables = again.tables(run, "key")
     assert tables is not None and [table.name for table in tables] == ["01", "02", "01"]
-    assert tables[1] == kept.Table("02", "pushed out", 5, 1, 1, 2, 3)
+    assert tables[1] == lockstep.Outcome("02", "pushed out", 5, 1, 1, 2, 3)
     assert again.made([run])["a"]["made_by"][-1]["cores"] >= 1
     assert Kept(tmp_path / "none.json").tables(run, "key") is None
 
