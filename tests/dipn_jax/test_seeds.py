@@ -96,7 +96,7 @@ def test_every_purpose_has_a_number_of_its_own() -> None:
 
 
 def test_commands_take_their_keys_from_here() -> None:
-    """A key of a seed alone would be shared by whoever else makes one; one of a constant is nobody's scene."""
+    """Two commands that each made a key of the seed alone would share it; keys of a constant draw no scenes."""
     root = pathlib.Path(__file__).parents[2]
     paths = [path for stage in ("datagen", "train", "eval") for path in (root / stage).rglob("*.py")]
     assert len(paths) > 30

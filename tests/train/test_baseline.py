@@ -139,7 +139,7 @@ class _Recorder:
 
 
 def test_outcomes_are_learnt_from_mirror_images_in_new_colours_and_pushes_are_never_turned_round() -> None:
-    """Heights rise along rows and along columns, so a mirrored image is told by its slopes."""
+    """Heights rise along rows and along columns, so the slopes show whether an image was mirrored."""
     count, wide = 64, 32
     rise = np.arange(wide)[:, None] / 64 + np.arange(wide) / 1024
     some = Window(

@@ -11,7 +11,7 @@ from dipn_jax.structs import Scene, SettledScene
 
 
 def _examples(*lengths: int) -> SettledScene:
-    """Return examples of scenes, of which each has so many; poses number them, and one number of a size differs."""
+    """Return examples, a given number of each scene; their poses are their numbers, and scenes differ in one size."""
     count = sum(lengths)
     size = np.full((count, 2, 3), 0.05, np.float32)
     size[:, 1, 2] = np.repeat(np.arange(len(lengths)) % 2, lengths)
