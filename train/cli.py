@@ -222,7 +222,7 @@ def baseline(
         scenes.parse_objects(objects),
         config,
         out,
-        scorer=scorers.aided_scorer(gn) if gn else None,
+        scorer=scorers.plain_scorer(gn) if gn else None,
         scored_by=checkpoint.digest(gn) if gn else "",
     )
     _say(out, result, digits=".3f")

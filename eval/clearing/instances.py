@@ -10,6 +10,7 @@ import numpy as np
 from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
+from dipn_jax.planning.memory import MissedGrasps
 from dipn_jax.storage import plain
 from dipn_jax.structs import Fault, Scene
 from dipn_jax.world import cases as case_files
@@ -38,7 +39,7 @@ class Instance:
     held: int = 0  # grasps that held something
     ended: str = ""  # cleared, pushed out, out of actions, fault
     did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action
-    missed: tuple[np.ndarray, ...] = ()  # grasps [3] that missed and around which nothing has moved since
+    missed: MissedGrasps = dataclasses.field(default_factory=MissedGrasps)  # and the table looks as then
     film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # poses and decision before each action
 
     @property

@@ -15,6 +15,7 @@ import numpy as np
 
 from dipn_jax import batching, console, seeds, structs
 from dipn_jax.engine import Engine
+from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.planning import candidates, methods
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
@@ -44,7 +45,7 @@ def evaluate(
     seed: int,
     others: int = 0,
     camera: Camera = DEFAULT_CAMERA,
-    remember: bool = True,
+    aids: tuple[Aid, ...] = ALL_AIDS,
 ) -> tuple[dict[str, Any], list[Instance]]:
     """Try the best-scored grasp until every table is empty, by the end rules of `eval.clearing`; also a random one.
 
@@ -57,15 +58,16 @@ def evaluate(
       seed: random seed of the scenes and of the random grasps.
       others: where a grasp missed, how many of the next best to try, each from the same state; 0: none.
       camera: what the scorer sees.
-      remember: halve the scores of grasps like one that missed until something near them moves.
+      aids: those of choosing a grasp that are not the scorer's, `top` and `memory`.
 
     Returns:
       Flat metrics: success with bootstrap 95 % intervals over tables, calibration; and the tables, ended.
     """
     tables = instances.random_instances(engine, config, count=scenes, seed=seed, purpose=Purpose.GRASP_TABLES)
     result = _random_foreground(scorer, engine, tables, seed)
-    decide = on_tables.in_lockstep(methods.grasping_policy(scorer), camera=camera)
-    tables = lockstep.clear(tables, engine, decide, partial, seed=seed, remember=remember)
+    policy = methods.grasping_policy(scorer, methods.PolicyConfig(aids=aids))
+    decide = on_tables.in_lockstep(policy, camera=camera)
+    tables = lockstep.clear(tables, engine, decide, partial, seed=seed, remember="memory" in aids)
     held = [np.array([did == "grasp held" for did in table.did], float) for table in tables]
     scores = np.concatenate([[step["values"][0] for step in table.film] for table in tables])
     result |= _rate("gn", [each.sum() for each in held], [len(each) for each in held])
@@ -131,16 +133,14 @@ def _other_grasps(
     if not misses:
         return result
     steps = [tables[number].film[action] for number, action in misses]
-    states = [
-        (tables[number].scene.replace(shape=step["shape"]), step["poses"], step["missed"])
-        for (number, _), step in zip(misses, steps, strict=True)
-    ]
-    scene, poses = structs.stack([state[0] for state in states]), np.stack([state[1] for state in states])
+    scenes = [tables[n].scene.replace(shape=step["shape"]) for (n, _), step in zip(misses, steps, strict=True)]
+    scene = structs.stack(scenes)
+    poses, missed, tried = (np.stack([step[key] for step in steps]) for key in ("poses", "missed", "grasp"))
     keys = jnp.stack([lockstep.action_key(seed, *miss) for miss in misses])
-    seen, missed = camera.look(keys, scene, poses), np.stack([state[2] for state in states])
-    grasps = batching.in_batches(functools.partial(_next_best, scorer=scorer, count=count), seen, missed)
+    seen = camera.look(keys, scene, poses)
+    grasps = batching.in_batches(functools.partial(_next_best, scorer=scorer, count=count), seen, missed, tried)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
-    index = np.repeat(np.arange(len(states)), count)
+    index = np.repeat(np.arange(len(steps)), count)
     held, begin = [], 0
     with console.Progress("other grasps", len(index), unit="grasps") as progress:
         while begin < len(index):
@@ -159,14 +159,14 @@ def _other_grasps(
 
 
 @functools.partial(jax.jit, static_argnames=("scorer", "count"))
-def _next_best(seen: Observation, missed: jax.Array, *, scorer: Scorer, count: int) -> Grasp:
-    def one(args: tuple[Observation, jax.Array]) -> Grasp:
-        image, known = args
+def _next_best(seen: Observation, missed: jax.Array, tried: jax.Array, *, scorer: Scorer, count: int) -> Grasp:
+    def one(args: tuple[Observation, jax.Array, jax.Array]) -> Grasp:
+        image, known, first = args
         scores = candidates.discount_missed(scorer(render.rgbd(image)[None])[0], known)
-        best = candidates.best_grasps(scores, count=count + 1)[1:]  # without the one that missed
+        best = candidates.best_grasps(candidates.without(scores, first), count=count)
         return candidates.grasp_at(best, image.height)
 
-    return jax.lax.map(one, (seen, missed))
+    return jax.lax.map(one, (seen, missed, tried))
 
 
 def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: int, each: int = 4) -> dict[str, float]:

@@ -61,7 +61,8 @@ def _table(did: list[str], place: str, *, friction: float = 0.5, mass: float = 0
     scene = Scene(np.full(1, ABSENT, np.int32), size, color, mass * one, friction * one)
     center = geometry.pixels_to_metres(jnp.array(PEAKS[place][::-1]))
     poses = np.array([[*center, 0.02, 1, 0, 0, 0]], np.float32)
-    known = {"shape": np.zeros(1, np.int32), "poses": poses, "missed": planner.NONE_MISSED}
+    grasp = np.array([0, *PEAKS["first"]], np.int32)
+    known = {"shape": np.zeros(1, np.int32), "poses": poses, "missed": planner.NONE_MISSED, "grasp": grasp}
     film = [known | {"values": np.array([0.9, 0, 0])} for _ in did]
     return Instance("x", scene, poses + 1, 1, did=did, film=film)
 
@@ -89,6 +90,13 @@ def test_other_grasps_are_ranked_with_the_misses_that_the_policy_knew() -> None:
     assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 0  # type: ignore[arg-type]
     row, col = PEAKS["second"]  # 0.8 is halved: the third is now the next best
     table.film[0]["missed"] = np.array([[0, row, col]], np.int32)
+    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 1  # type: ignore[arg-type]
+
+
+def test_the_grasp_that_missed_is_left_out_whatever_its_rank() -> None:
+    table = _table(["grasp missed"], "first")
+    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 0  # type: ignore[arg-type]
+    table.film[0]["grasp"] = np.array([0, *PEAKS["second"]], np.int32)
     assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 1  # type: ignore[arg-type]
 
 
