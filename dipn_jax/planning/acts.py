@@ -59,7 +59,7 @@ def comparing(push_scorer: Scorer, scorer: Scorer, plain: Scorer, *, grasp_at_on
             seen,
             push_scorer,
             scorer,
-            plain,
+            plain=plain,
             distance=distances[0],
             grasp_above=above,
             top_margin=rule.top_margin,

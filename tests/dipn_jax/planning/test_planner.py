@@ -145,7 +145,9 @@ def test_a_grasp_is_chosen_by_one_value_and_compared_by_another(seen: Observatio
         return lambda images: jnp.full((images.shape[0], 16, 224, 224), value).at[:, 2, 112, 30].add(peak)
 
     def decide(push: float, **options: Any) -> Any:
-        return planner.decide_by_value(seen, valued(push), valued(0.1, 0.2), valued(0.5, 0.1), distance=0.1, **options)
+        return planner.decide_by_value(
+            seen, valued(push), valued(0.1, 0.2), plain=valued(0.5, 0.1), distance=0.1, **options
+        )
 
     decision = decide(0.55)
     assert not decision.is_push and decision.grasp_pixel.tolist() == [2, 112, 30]
