@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import zlib
 
 import numpy as np
 
@@ -33,6 +34,7 @@ class Instance:
     scene: Scene  # numpy, [N]
     poses: np.ndarray  # [N, 7]
     objects: int
+    number: int = 0  # of its random keys; it does not depend on the other tables
     grasps: int = 0
     pushes: int = 0
     removed: int = 0
@@ -106,7 +108,8 @@ def random_instances(
 
 
 def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instance]:
+    numbers = [zlib.crc32(f"{name}/{names[:i].count(name)}".encode()) for i, name in enumerate(names)]
     return [
-        Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
+        Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()), numbers[i])
         for i, name in enumerate(names)
     ]

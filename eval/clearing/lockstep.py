@@ -62,7 +62,7 @@ def clear(
             rows = [instances[number] for number in active]
             before = sum(instance.removed for instance in instances)
             scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
-            now = jnp.stack([action_key(seed, number, instances[number].actions) for number in active])
+            now = jnp.stack([action_key(seed, row.number, row.actions) for row in rows])
             decision, seen = decide(now, scene, poses, functools.partial(_recall, rows))
             for is_push, act in ((True, functools.partial(_push, longest=longest)), (False, _grasp)):
                 which = np.flatnonzero(decision.is_push == is_push)
@@ -81,7 +81,7 @@ def clear(
 
 
 def action_key(seed: int, number: int, action: int) -> jax.Array:
-    """Return the random key of one action on one table: of the noise of its image, and of the push candidates."""
+    """Return the random key of one action on the table of a `number`: of the noise of its image, and of candidates."""
     return jax.random.fold_in(jax.random.fold_in(seeds.key(seed, seeds.Purpose.CLEARING_CANDIDATES), number), action)
 
 

@@ -64,7 +64,7 @@ def evaluate(
       Flat metrics: success with bootstrap 95 % intervals over tables, calibration; and the tables, ended.
     """
     tables = instances.random_instances(engine, config, count=scenes, seed=seed, purpose=Purpose.GRASP_TABLES)
-    result = _random_foreground(scorer, engine, tables, seed)
+    result = _random_foreground(scorer, engine, tables, seed, camera)
     policy = methods.grasping_policy(scorer, methods.PolicyConfig(aids=aids))
     decide = on_tables.in_lockstep(policy, camera=camera)
     tables = lockstep.clear(tables, engine, decide, partial, seed=seed, remember="memory" in aids)
@@ -85,12 +85,15 @@ def _rate(name: str, hits: Any, trials: Any) -> dict[str, float]:
     return {f"grasp_success/{name}": value, f"grasp_success/{name}_low": low, f"grasp_success/{name}_high": high}
 
 
-def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], seed: int) -> dict[str, Any]:
+def _random_foreground(
+    scorer: Scorer, engine: Engine, tables: list[Instance], seed: int, camera: Camera
+) -> dict[str, Any]:
     """Try a grasp of a random foreground pixel on each table; return how it went and what the scorer said."""
     scene = structs.stack([table.scene for table in tables])
     poses = np.stack([table.poses for table in tables])
     keys = jax.random.split(seeds.key(seed, Purpose.RANDOM_GRASPS), len(tables))
-    grasps, scores = batching.in_batches(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
+    seen = camera.look(keys, scene, poses)
+    grasps, scores = batching.in_batches(functools.partial(_random_grasp, scorer=scorer), keys, seen)
     rollout, outcome = primitives.grasp(engine, scene, poses, jax.device_get(grasps))
     good = Fault.usable(rollout.fault)
     success = np.asarray(outcome.success, float)[good]
@@ -99,15 +102,15 @@ def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], s
 
 
 @functools.partial(jax.jit, static_argnames="scorer")
-def _random_grasp(keys: jax.Array, scene: Scene, poses: jax.Array, *, scorer: Scorer) -> tuple[Grasp, jax.Array]:
-    def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Grasp, jax.Array]:
-        seen = render.render(*args[1:])
-        grasps = candidates.random_grasps(args[0], seen, count=1)
+def _random_grasp(keys: jax.Array, seen: Observation, *, scorer: Scorer) -> tuple[Grasp, jax.Array]:
+    def one(args: tuple[jax.Array, Observation]) -> tuple[Grasp, jax.Array]:
+        key, seen = args
+        grasps = candidates.random_grasps(key, seen, count=1)
         chosen: Grasp = jax.tree.map(lambda leaf: leaf[0], grasps)
         rotation, row, col = candidates.grasp_index(chosen)
         return chosen, scorer(render.rgbd(seen)[None])[0, rotation, row, col]
 
-    return jax.lax.map(one, (keys, scene, poses))
+    return jax.lax.map(one, (keys, seen))
 
 
 def _other_grasps(
@@ -136,7 +139,7 @@ def _other_grasps(
     scenes = [tables[n].scene.replace(shape=step["shape"]) for (n, _), step in zip(misses, steps, strict=True)]
     scene = structs.stack(scenes)
     poses, missed, tried = (np.stack([step[key] for step in steps]) for key in ("poses", "missed", "grasp"))
-    keys = jnp.stack([lockstep.action_key(seed, *miss) for miss in misses])
+    keys = jnp.stack([lockstep.action_key(seed, tables[number].number, action) for number, action in misses])
     seen = camera.look(keys, scene, poses)
     grasps = batching.in_batches(functools.partial(_next_best, scorer=scorer, count=count), seen, missed, tried)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dipn_jax.eval.clearing import instances, lockstep, on_tables
+from dipn_jax.eval.clearing.camera import Camera
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.grasping import success
 
 from dipn_jax import geometry, structs
 from dipn_jax.planning import planner, scorers
 from dipn_jax.storage.resume import Partial
-from dipn_jax.structs import ABSENT, Array, Fault, Grasp, Rollout, Scene, SettledScene, Trajectory
+from dipn_jax.structs import ABSENT, Array, Fault, Grasp, Observation, Rollout, Scene, SettledScene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import clutter, scenes
 
@@ -109,7 +110,16 @@ def test_a_random_grasp_that_went_wrong_does_not_count() -> None:
     tables = [_table([], "first", mass=mass, friction=f) for mass, f in ((0.1, 0.5), (HEAVY, 0.5), (HEAVY, FAULTY))]
     for table in tables:
         table.scene, table.poses = table.scene.replace(shape=np.zeros(1, np.int32)), table.poses - 1
-    found = success._random_foreground(peaks, Lifts(reach=1), tables, 0)  # type: ignore[arg-type]
+    seen = []
+
+    class Noisy(Camera):
+        def look(self, *args: Any) -> Observation:
+            seen.append(super().look(*args))
+            return seen[-1]
+
+    camera = Noisy(height_noise=0.001)
+    found = success._random_foreground(peaks, Lifts(reach=1), tables, 0, camera)  # type: ignore[arg-type]
+    assert np.std(seen[0].height[:, :40, 200:]) == pytest.approx(0.001, rel=0.1), "what the camera sees is grasped"
     assert found["grasp_success/random_foreground"] == pytest.approx(1 / 2)
     assert found["random/reliability/0/count"] == 2 and found["random/expected_calibration_error"] == pytest.approx(0.5)
 
