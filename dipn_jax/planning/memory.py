@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from dipn_jax import geometry
 from dipn_jax.storage import plain
 from dipn_jax.structs import Array
 from dipn_jax.workspace import WORKSPACE
@@ -70,6 +73,25 @@ def looks_changed(before: Float[Array, "S S"], after: Float[Array, "S S"]) -> bo
     offset = np.arange(len(smooth[0])) - RADIUS
     disk = np.hypot(*np.meshgrid(offset, offset)) <= RADIUS
     return int((np.abs(smooth[0] - smooth[1]) > CHANGED_HEIGHT)[disk].sum()) > CHANGED_PIXELS
+
+
+def forget_changed(
+    missed: Int[Array, "M 3"], before: Float[Array, "H W"], after: Float[Array, "H W"]
+) -> Int[jax.Array, "M 3"]:
+    """Return grasps that missed, with -1 for those around which a predicted height map differs from the one before it.
+
+    Neither map is smoothed, because what is predicted keeps the noise of what is seen.
+
+    Args:
+      missed: rotation, row, col; -1: none.
+      before: metres.
+      after: metres.
+    """
+    changed = jnp.abs(jnp.asarray(after) - jnp.asarray(before)) > CHANGED_HEIGHT
+    away = geometry.view_grid(*changed.shape) - jnp.asarray(missed)[:, None, None, :0:-1]
+    near = jnp.linalg.norm(away, axis=-1) <= RADIUS
+    other = (near & changed).sum((1, 2)) > CHANGED_PIXELS
+    return jnp.where(other[:, None], -1, jnp.asarray(missed))
 
 
 def _around(grasp: np.ndarray, height: Array) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Key
 
-from dipn_jax.planning import candidates
+from dipn_jax.planning import candidates, memory
 from dipn_jax.sight import fingers, imagine, masks, render
 from dipn_jax.structs import Array, Candidates, Decision, Observation, Push, Pytree
 
@@ -173,7 +173,8 @@ def _count_actions(
     now = estimate(observation, missed)
 
     def after() -> jax.Array:
-        return 1.0 + estimate(imagine.imagine(observation, centers, _drawn(decision.motion, rule)), missed)
+        there = imagine.imagine(observation, centers, _drawn(decision.motion, rule))
+        return 1.0 + estimate(there, memory.forget_changed(missed, observation.height, there.height))
 
     cost = jax.lax.cond(jnp.isfinite(decision.value_push), after, lambda: jnp.float32(jnp.inf))
     return decision.replace(is_push=cost < now, value_now=-now, value_push=-cost)

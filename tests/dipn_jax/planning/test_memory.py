@@ -97,3 +97,12 @@ def test_the_latest_eight_are_remembered_in_order() -> None:
         wanted = list(range(max(1, number - 7), number + 1))
         assert pixels[:, 0].tolist() == [*wanted, *[-1] * (8 - len(wanted))]
     assert len(remembered.recall(height).grasps) == len(remembered.around) == 8
+
+
+def test_in_a_predicted_map_misses_are_forgotten_where_something_has_moved() -> None:
+    before = _height((0, 0), FAR)
+    missed = np.stack([_pixel(0, 0), _pixel(*FAR), np.full(3, -1, np.int32)])
+    for after in (before, _height((0.05, 0), FAR), _height((0, 0), FAR, turned=np.pi / 4), _height((0, 0), (0, 0.15))):
+        found = np.asarray(memory.forget_changed(missed, before, after))
+        wanted = [missed[i] if _remembered(before, after, at) else np.full(3, -1) for i, at in enumerate([(0, 0), FAR])]
+        np.testing.assert_array_equal(found, [*wanted, np.full(3, -1)])
