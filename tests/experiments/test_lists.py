@@ -7,7 +7,7 @@ import pytest
 
 from experiments import clearing, demo, grasping, push_prediction, runs
 
-COUNTS = {demo: 11, push_prediction: 52, grasping: 31, clearing: 331}
+COUNTS = {demo: 11, push_prediction: 52, grasping: 31, clearing: 261}
 """Number of runs of each experiment."""
 
 each = pytest.mark.parametrize("experiment", COUNTS, ids=lambda module: module.__name__.rpartition(".")[2])
