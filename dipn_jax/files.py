@@ -14,6 +14,7 @@ import shutil
 import time
 from typing import Any
 
+from dipn_jax import typed
 from dipn_jax.errors import UserError
 
 
@@ -131,21 +132,20 @@ def write_json(path: pathlib.Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
+def read_json(path: pathlib.Path, *, wanted: typed.Form = dict) -> Any:
     """Return what a JSON file holds.
 
     Raises:
-      UserError: it is missing, is not JSON, or is not a `wanted` at its top.
+      UserError: it is missing, is not JSON, or does not have the form `wanted`.
     """
     try:
-        value = json.loads(read_text(path))
+        return typed.check(typed.parse(path.read_bytes()), wanted)
     except FileNotFoundError:
         raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
-    except (OSError, ValueError):
-        raise UserError(f"{path}: damaged, not JSON; delete it or give another folder") from None
-    if not isinstance(value, wanted):
-        raise UserError(f"{path}: holds a {type(value).__name__}, want a {wanted.__name__}; give another folder")
-    return value
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); mend that, or give another folder") from None
+    except typed.Misfit as error:
+        raise UserError(f"{path}: damaged, {error}; delete it or give another folder") from None
 
 
 def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = ()) -> None:
