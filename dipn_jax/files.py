@@ -148,6 +148,21 @@ def read_json(path: pathlib.Path, *, wanted: typed.Form = dict) -> Any:
         raise UserError(f"{path}: damaged, {error}; delete it or give another folder") from None
 
 
+def read_lines(path: pathlib.Path, *, wanted: typed.Form = dict) -> list[Any]:
+    """Return what the lines of a log hold, each of them JSON.
+
+    Raises:
+      UserError: it is missing, or a line of it is not JSON or does not have the form `wanted`.
+    """
+    try:
+        lines = read_text(path).splitlines()
+        return [typed.check(typed.parse(line), wanted, at=f"line {n}") for n, line in enumerate(lines, 1)]
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); give the --out of a dipn-train command") from None
+    except ValueError as error:  # a Misfit, or text that is not UTF-8
+        raise UserError(f"{path}: damaged, {error}; train again, or give another --out") from None
+
+
 def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = ()) -> None:
     """Write `out/config.json`, or check that the folder was begun with the same one.
 

@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from dipn_jax import files, machine, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import codec, layout
+from dipn_jax.storage.layout import KINDS
 
 SCHEMA_VERSION = 2
 """Version of the format; shards of another version are refused."""
@@ -45,8 +46,8 @@ def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
 
 
 def shard_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Return the files of a folder that have a shard's name, in order; a link that leads nowhere is one, too."""
-    return sorted(path for path in folder.glob("shard-*.parquet") if path.is_symlink() or not path.is_dir())
+    """Return what has a shard's name in a folder, in order."""
+    return sorted(folder.glob("shard-*.parquet"))
 
 
 def write_shard(
@@ -57,8 +58,8 @@ def write_shard(
     Args:
       folder: the data set.
       index: the shard's number.
-      episodes: a struct of `layout.KINDS[kind]` with a leading `[B]` axis.
-      kind: a key of `layout.KINDS`.
+      episodes: a struct of `KINDS[kind]` with a leading `[B]` axis.
+      kind: a key of `KINDS`.
       config: what determines the data set, with its seed; it has to fit into JSON.
       faults: counts of drops and faults.
     """
@@ -144,7 +145,7 @@ def count(path: pathlib.Path) -> int:
 
 
 def read_shard(path: pathlib.Path, *, kind: str) -> Any:
-    """Return the episodes of a shard: a struct of `layout.KINDS[kind]` with a leading `[B]` axis, NumPy arrays.
+    """Return the episodes of a shard: a struct of `KINDS[kind]` with a leading `[B]` axis, NumPy arrays.
 
     Raises:
       UserError: see `read_meta`; or the shard is of another kind.
@@ -163,4 +164,4 @@ def read_shard(path: pathlib.Path, *, kind: str) -> Any:
             values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"])
             columns[name] = values.reshape(meta["episodes"], *spec["shape"])
         coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
-        return codec.assemble(layout.KINDS[kind], codec.decode(columns, coded))
+        return codec.assemble(KINDS[kind], codec.decode(columns, coded))
