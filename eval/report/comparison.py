@@ -12,7 +12,7 @@ import numpy as np
 from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 
-from .. import drawing, metrics
+from .. import drawing
 from ..clearing import film, lockstep
 from . import paper
 
@@ -20,6 +20,8 @@ FRAMES = 10
 """Number of pictures in a filmstrip."""
 FILM_ROWS = 4
 """Number of steps in the figure of predictions."""
+COUNTS = ("instances", "grasps", "pushes")
+"""Metrics that are numbers of something."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",
@@ -49,7 +51,8 @@ class Cleared:
 
     def __init__(self, folder: pathlib.Path) -> None:
         self.folder = folder
-        self.values = metrics.read(folder)
+        self.values = files.read_json(folder / "metrics.json", wanted={str: typed.Maybe(float)})
+        files.read_json(folder / "metrics.json", wanted=dict.fromkeys(COUNTS, typed.Whole()))
         settings = files.read_json(folder / "settings.json", wanted=_SETTINGS)
         self.method, self.label = settings["method"], settings["label"]
         cases = settings["tables.cases"]
@@ -100,8 +103,9 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     parts, figures = ["<h2>Clearing tables</h2>"], {}
     for tables in dict.fromkeys(one.tables for one in all_cleared):
         rows = [one for one in all_cleared if one.tables == tables]
-        parts.append(f"<h3>{drawing.escaped(tables)}</h3>{_table(rows, paper.TABLE.get(tables, {}))}")
-        parts.append(f"<p>Why tables were not cleared:</p>{_causes(rows)}{{course-{tables}}}")
+        results, causes = results_and_causes(rows)
+        parts.append(f"<h3>{drawing.escaped(tables)}</h3>{results}")
+        parts.append(f"<p>Why tables were not cleared:</p>{causes}{{course-{tables}}}")
         figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
             place = f"clear-{tables}-{number}"
@@ -120,11 +124,16 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     return "".join(parts), figures
 
 
+def results_and_causes(rows: list[Cleared]) -> tuple[str, str]:
+    """Return the HTML tables of results on the same tables, beside the paper's, and of why some were not cleared."""
+    return _table(rows, paper.TABLE.get(rows[0].tables, {})), _causes(rows)
+
+
 def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> str:
     head = ["", "tables", "grasps", "pushes", *[f"{column.replace('_', ' ')} %" for column in paper.COLUMNS]]
     lines = []
     for one in rows:
-        counts = [str(one.values[key]) for key in ("instances", "grasps", "pushes")]
+        counts = [str(one.values[key]) for key in COUNTS]
         lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in paper.COLUMNS]])
     for method, numbers in published.items():
         lines.append([f"{method}, the paper", "", "", "", *[f"{number:.1f}" for number in numbers]])
