@@ -180,8 +180,9 @@ def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] 
         different = [key for key in mine if key not in free and theirs.get(key) != mine[key]]
         if different:
             key = different[0]
+            begun = typed.one_line(str(theirs.get(key)), most=200)
             raise UserError(
-                f"{out}: begun with {key}={theirs.get(key)}, asked for {key}={mine[key]}; give another --out, or the "
+                f"{out}: begun with {key}={begun}, asked for {key}={mine[key]}; give another --out, or the "
                 "same options and data to continue"
             )
     write_json(path, mine)

@@ -158,10 +158,14 @@ def brief(value: Any) -> str:
         return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
     if isinstance(value, int) and abs(value) > _MOST:
         return "a number of many digits"
-    text = value if isinstance(value, str) else json.dumps(value)
-    text = text.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else text
+    return one_line(value if isinstance(value, str) else json.dumps(value))
+
+
+def one_line(text: str, *, most: int = 60) -> str:
+    """Return a text on one line, of `most` characters at most, all of which can be printed."""
+    text = text.encode("utf-8", "backslashreplace").decode()
     text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def inside(folder: pathlib.Path, name: str) -> pathlib.Path:
