@@ -154,13 +154,19 @@ def read_lines(path: pathlib.Path, *, wanted: typed.Form = dict) -> list[Any]:
     Raises:
       UserError: it is missing, or a line of it is not JSON or does not have the form `wanted`.
     """
+    found: list[Any] = []
     try:
-        lines = read_text(path).splitlines()
-        return [typed.check(typed.parse(line), wanted, at=f"line {n}") for n, line in enumerate(lines, 1)]
+        for line in read_text(path).splitlines():
+            found.append(typed.check(typed.parse(line), wanted))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); give the --out of a dipn-train command") from None
-    except ValueError as error:  # a Misfit, or text that is not UTF-8
-        raise UserError(f"{path}: damaged, {error}; train again, or give another --out") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: damaged, not UTF-8; train again, or give another --out") from None
+    except typed.Misfit as error:
+        raise UserError(
+            f"{path}: damaged, line {len(found) + 1}: {error}; train again, or give another --out"
+        ) from None
+    return found
 
 
 def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = ()) -> None:

@@ -114,6 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="python -m experiments.fuzz", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--list", action="store_true", help="show the parsers")
+    parser.add_argument("--dry-run", action="store_true", help="show what would be done")
     parser.add_argument("--only", nargs="+", default=[], metavar="PARSER", help="these parsers")
     parser.add_argument("--inputs", type=int, default=10_000, help="given to each parser")
     parser.add_argument("--seed", type=int, default=0, help="of the inputs")
@@ -131,6 +132,9 @@ def _work(options: argparse.Namespace) -> int:
     chosen = [one for name, one in fuzz_parsers.PARSERS.items() if not options.only or name in options.only]
     if options.list:
         console.say("\n".join(f"{one.name}: {one.file}" for one in chosen))
+        return 0
+    if options.dry_run:
+        console.say("\n".join(f"{one.name}: {options.inputs} mutations of {one.file}" for one in chosen))
         return 0
     kept: dict[str, Any] = {}
     failed = 0

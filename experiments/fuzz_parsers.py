@@ -102,7 +102,9 @@ def _repair(folder: pathlib.Path) -> None:
     assert read is None or records.load(copied, kind="push"), "what can be read is kept"
 
 
+@functools.lru_cache(maxsize=1)
 def _state(folder: pathlib.Path) -> resume.Partial:
+    """Return what loads and saves a state; to make it, all sources are read."""
     return resume.Partial(folder, {"seed": 0})
 
 

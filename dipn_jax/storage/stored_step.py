@@ -34,6 +34,9 @@ def config(cls: type, values: dict[str, Any]) -> Any:
       TypeError: they do not fit it.
     """
     form = {f"{field.name}?": _form(field.default) for field in dataclasses.fields(cls)}
+    unknown = sorted(set(values) - {field.name for field in dataclasses.fields(cls)})
+    if unknown:
+        raise TypeError(f"no option {typed.brief(unknown[0])}")
     try:
         typed.check(values, form)
         return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})

@@ -124,5 +124,7 @@ def test_counts_stand_in_the_file_of_results_beside_others(
     assert counts["inputs"] == 20 == counts["accepted"] + counts["refused"] and counts["tracebacks"] == 0
     assert counts["commit"] and counts["seed"] == 0
     assert f"| log | 20 | {counts['accepted']} | {counts['refused']} | 0 |" in capsys.readouterr().out
+    assert fuzz.main(["--dry-run", "--only", "log"]) == 0
+    assert capsys.readouterr().out == "log: 10000 mutations of metrics.jsonl\n"
     assert fuzz.main(["--only", "nothing", "--results", str(path)]) == 2
     assert "--only nothing: no such parser" in capsys.readouterr().err

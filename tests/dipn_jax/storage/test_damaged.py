@@ -193,7 +193,7 @@ def test_a_shard_that_is_a_link_out_of_the_folder_is_set_aside(copy: pathlib.Pat
         ({"network_config": {"width": -3}}, "its config does not fit this version"),
         ({"network_config": {"stages": 3}}, "its config does not fit this version"),
         ({"network_config": {"preset": "huge"}}, "its config does not fit this version"),
-        ({"network_config": {"depth": 3}}, "its config does not fit this version"),
+        ({"network_config": {"de\npth": 3}}, r"its config does not fit this version .no option de\?pth"),
         ({"network_config": {"width": 60_000}}, "its config is of a larger network than its arrays"),
         ({"network_config": {"width": 25}}, "made for another architecture"),
     ],
