@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import json
 import pathlib
 import shutil
 from collections.abc import Callable
@@ -160,17 +161,22 @@ def _network(folder: pathlib.Path) -> None:
 
 
 @functools.cache
-def _shipped_config() -> Any:
-    found = checkpoint.newest(checkpoint.find(pathlib.Path("builtin"), network="grasp"))
-    return found and found[1]["network_config"]
+def _loaded(folder: pathlib.Path, config: str) -> str:
+    """Return why a network of this config is refused; an empty text if it is loaded."""
+    try:
+        checkpoint.load_network(folder, network="grasp")
+    except UserError as error:
+        return str(error)
+    return ""
 
 
 def _load_network(folder: pathlib.Path) -> None:
-    """Load a network; where the config is the shipped one, only its metadata, for the rest takes long."""
+    """Load a network; where one of this config was loaded before, only its metadata, for the rest takes long."""
     found = checkpoint.newest(folder)
-    if found is not None and found[1]["network"] == "grasp" and found[1]["network_config"] == _shipped_config():
-        return
-    checkpoint.load_network(folder, network="grasp")
+    if found is None or found[1]["network"] != "grasp":
+        checkpoint.load_network(folder, network="grasp")
+    elif refused := _loaded(folder, json.dumps(found[1]["network_config"])):
+        raise UserError(refused)
 
 
 def _log(folder: pathlib.Path) -> None:
@@ -209,9 +215,9 @@ def _parsers() -> list[Parser]:
 
 
 def _copy_cases(folder: pathlib.Path) -> None:
-    """Write a case file of two of the shipped cases."""
-    found = files.read_json(cases.hard_cases_path())["cases"][:2]
-    files.write_json(folder / "c.json", {"cases": found})
+    """Write a case file: one of the shipped cases, without most of its objects."""
+    case = files.read_json(cases.hard_cases_path())["cases"][0]
+    files.write_json(folder / "c.json", {"cases": [case | {"objects": case["objects"][:2]}]})
 
 
 def _configuration(folder: pathlib.Path) -> None:
