@@ -199,7 +199,7 @@ def _parsers() -> list[Parser]:
     return [
         Parser("case file", "c.json", _copy_cases, lambda at: cases.load_cases(at / "c.json"), tree),
         Parser("configuration", "config.json", data_set, _configuration, tree),
-        Parser("command kept", "asked.json", data_set, records.missing, tree),
+        Parser("command kept", "asked.json", data_set, _missing, tree),
         Parser("manifest", "manifest.json", data_set, _look_at_data, tree),
         Parser("shard", "shard-00000.parquet", _one_shard, _look_at_shard, table),
         Parser("repair", "shard-00000.parquet", _one_shard, _repair, table),
@@ -225,6 +225,12 @@ def _configuration(folder: pathlib.Path) -> None:
     records.missing(folder)
     begun = files.read_json(folder / "config.json")
     files.claim(folder, {"kind": "push", "episodes": begun["episodes"], "seed": 0}, free=("episodes",))
+
+
+def _missing(folder: pathlib.Path) -> None:
+    """Say what is missing, on one line."""
+    said = records.missing(folder)
+    assert said and "\n" not in said
 
 
 def _one_shard(folder: pathlib.Path) -> None:

@@ -19,6 +19,8 @@ ASKED = "asked.json"
 """Name of the file with the command that makes a data set."""
 MOST_NAMED = 8
 """Shards that a message names at most."""
+MOST_SHOWN = 4000
+"""Characters of a command that a message shows at most."""
 NOT_RECORDED = "not recorded"
 """What stands for the kind of processor of a shard that does not say it."""
 
@@ -105,7 +107,7 @@ def _command(folder: pathlib.Path, gaps: Sequence[int], *, every: bool) -> str:
     workers = {index % found["of"] for index in gaps}
     if found["of"] > 1 and len(workers) == 1 and every:
         command += ["--shard", str(min(workers)), "--of", str(found["of"])]
-    return f"`{shlex.join(command)}`"
+    return f"`{typed.one_line(shlex.join(command), most=MOST_SHOWN)}`"
 
 
 def makers(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

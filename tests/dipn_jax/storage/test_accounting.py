@@ -80,6 +80,13 @@ def test_of_many_missing_shards_some_are_named(tmp_path: pathlib.Path) -> None:
     assert said.endswith(f"run `dipn-datagen push --out {tmp_path}`")
 
 
+def test_a_command_is_shown_on_one_line_and_as_a_shell_reads_it(tmp_path: pathlib.Path) -> None:
+    files.write_json(tmp_path / "config.json", {"episodes": 8, "shard_size": 8})
+    accounting.note(tmp_path, ["grasp", "--grasp-net", "my runs/gn; x", "a\nb"], of=1)
+    said = str(accounting.missing(tmp_path, {}))
+    assert f"run `dipn-datagen grasp --grasp-net 'my runs/gn; x' 'a?b' --out {tmp_path}`" in said and "\n" not in said
+
+
 def test_where_nothing_was_asked_for_nothing_is_missing(copy: pathlib.Path) -> None:
     _without(copy, 1)
     assert str(records.missing(copy)).endswith("missing: run the command that made it again"), "none was kept"

@@ -124,6 +124,7 @@ def test_a_damaged_shard_is_one_line_wherever_it_is_read_and_is_set_aside(
             (copy / "manifest.json").write_text(json.dumps(manifest))
         if not (listed and damage == "empty places"):  # which are seen where all of it is read
             capsys.readouterr()
+            assert [found for found, _ in records.verify(copy)] == [path], "listed, not raised"
             assert _command("verify", copy) == 2
             said = capsys.readouterr().err
             assert said.count("\n") == 1 and "run dipn-datagen repair" in said and "shard-00001.parquet" in said
