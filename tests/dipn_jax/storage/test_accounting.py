@@ -80,6 +80,13 @@ def test_of_many_missing_shards_some_are_named(tmp_path: pathlib.Path) -> None:
     assert said.endswith(f"run `dipn-datagen push --out {tmp_path}`")
 
 
+def test_where_not_all_missing_shards_are_looked_at_the_command_makes_everything(tmp_path: pathlib.Path) -> None:
+    files.write_json(tmp_path / "config.json", {"episodes": 40, "shard_size": 1})
+    accounting.note(tmp_path, ["push"], of=2)
+    said = str(accounting.missing(tmp_path, dict.fromkeys(range(1, 19, 2), 1)))  # the first gaps are of one worker
+    assert "shards 0, 2, 4, 6, 8, 10, 12, 14 and 23 more missing" in said and "--of" not in said
+
+
 def test_a_command_is_shown_on_one_line_and_as_a_shell_reads_it(tmp_path: pathlib.Path) -> None:
     files.write_json(tmp_path / "config.json", {"episodes": 8, "shard_size": 8})
     accounting.note(tmp_path, ["grasp", "--grasp-net", "my runs/gn; x", "a\nb"], of=1)
