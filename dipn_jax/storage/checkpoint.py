@@ -80,7 +80,7 @@ def save(
     try:
         _write(temporary, parts, about, extra)
         shutil.rmtree(final, ignore_errors=True)
-        temporary.rename(final)
+        files.move(temporary, final)
     finally:
         files.remove_folder(temporary)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
