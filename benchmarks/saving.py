@@ -51,7 +51,8 @@ class _Training:
     def __init__(self, folder: str, seed: int) -> None:
         self.run, self.task = pathlib.Path(folder) / "run", small_task(folder, "compact", seed)
         self.model: Any = checkpoint.build("dipn", self.task.network_config, seed=seed)
-        self.graph, self.params, self.rest = nnx.split(self.model, nnx.Param, ...)  # type: ignore[misc]
+        parts: Any = nnx.split(self.model, nnx.Param, ...)
+        self.graph, self.params, self.rest = parts
         optimizer = make_optimizer(PUSH)
         self.moments = optimizer.init(self.params)
         self.step, self.done = make_step(self.task, self.graph, optimizer), 0

@@ -36,7 +36,7 @@ def _task(name: str, data: dict[str, pathlib.Path]) -> Any:
 def _state(run: pathlib.Path, task: Any) -> list[np.ndarray]:
     """Return all arrays of a run's newest step: weights, and what only training needs."""
     folder, _ = checkpoint.newest(run)  # type: ignore[misc]
-    arrays = [checkpoint._numpy_arrays((folder / part).resolve()) for part in ("model", "train")]
+    arrays = [checkpoint.numpy_arrays((folder / part).resolve()) for part in ("model", "train")]
     assert len(arrays[1]) > 2
     network = checkpoint.load_network(run, network=task.network)
     return [
