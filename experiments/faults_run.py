@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import orbax.checkpoint as ocp
 
 from dipn_jax import files, structs
 from dipn_jax.errors import UserError
@@ -124,17 +125,22 @@ def result(out: pathlib.Path) -> Result:
         if found is None:
             raise UserError(f"{out}: no whole step")
         folder, meta = found
-        arrays = {
-            name: _digest(checkpoint.numpy_arrays(folder / name))
-            for name in ("model", "train")
-            if (folder / name).exists()
-        }
+        arrays = {name: _digest(arrays_of(folder / name)) for name in ("model", "train") if (folder / name).exists()}
         lines = files.read_text(out / "metrics.jsonl").splitlines()
         plain = {key: value for key, value in meta.items() if key != "sha256"}
         return Result(lines, arrays | {"meta": repr(sorted(plain.items())), "metrics": "\n".join(lines)})
     entries = files.read_json(out / "episodes.json", wanted=list)
     names = ("metrics.json", "settings.json", "episodes.json", *(entry["file"] for entry in entries))
     return Result([repr(entry) for entry in entries], {name: files.file_sha256(out / name) for name in names})
+
+
+def arrays_of(part: pathlib.Path) -> dict[str, np.ndarray]:
+    """Return the arrays of one part of a step, `STEP/model` or `STEP/train`, by their names in the order of these."""
+    checkpointer = ocp.PyTreeCheckpointer()
+    names = sorted(checkpointer.metadata(part.resolve()).item_metadata.tree)
+    as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in names}
+    found = checkpointer.restore(part.resolve(), restore_args=as_numpy)
+    return {name: found[name] for name in names}
 
 
 def _digest(tree: Any) -> str:

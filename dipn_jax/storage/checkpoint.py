@@ -192,7 +192,7 @@ def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
     Raises:
       UserError: the stored arrays have other names or shapes.
     """
-    stored = numpy_arrays((folder / name).resolve())
+    stored = _numpy_arrays((folder / name).resolve())
     wanted = _flat(target)
     different = sorted(set(stored) ^ set(wanted)) + [
         key for key in wanted if key in stored and stored[key].shape != _stored_shape(wanted[key])
@@ -222,7 +222,7 @@ def _on_device(stored: np.ndarray, *, like: Any) -> jax.Array:
     return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if is_key(like) else array
 
 
-def numpy_arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
+def _numpy_arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
     """Return the arrays of one Orbax folder by their path in the tree, whatever devices saved them."""
     checkpointer = ocp.PyTreeCheckpointer()
     stored = checkpointer.metadata(part).item_metadata.tree

@@ -39,9 +39,14 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
         except OSError:
             _warn_of_no_locks(folder)
         manifest = _rebuild_manifest(folder)
-        while set(manifest["shards"]) != {path.name for path in folder.glob("shard-*.parquet")}:
-            manifest = _rebuild_manifest(folder)  # one that nothing kept from writing has added a shard meanwhile
+        while set(manifest["shards"]) != {path.name for path in _shard_files(folder)}:
+            manifest = _rebuild_manifest(folder)  # somebody whom no lock kept waiting has added a shard
         return manifest
+
+
+def _shard_files(folder: pathlib.Path) -> list[pathlib.Path]:
+    """Return the files of a folder that have a shard's name, in their order."""
+    return sorted(folder.glob("shard-*.parquet"))
 
 
 @functools.cache
@@ -54,7 +59,7 @@ def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """Write the manifest anew, as `update_manifest` says, and return it."""
     known = _read_manifest(folder)["shards"] if (folder / MANIFEST).exists() else {}
     entries: dict[str, Any] = {}
-    for path in sorted(folder.glob("shard-*.parquet")):
+    for path in _shard_files(folder):
         entry = known.get(path.name)
         if entry is None or entry["bytes"] != path.stat().st_size:
             meta = shards.read_meta(path)
@@ -105,7 +110,7 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
         else:
             shards.read_meta(path)  # of this schema version
     listed = set(manifest["shards"])
-    problems += [(p, "not in the manifest") for p in sorted(folder.glob("shard-*.parquet")) if p.name not in listed]
+    problems += [(p, "not in the manifest") for p in _shard_files(folder) if p.name not in listed]
     return problems
 
 
@@ -122,7 +127,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     except UserError:
         known = {}
     removed = []
-    for path in sorted(folder.glob("shard-*.parquet")):
+    for path in _shard_files(folder):
         try:
             shards.read_shard(path, kind=shards.read_meta(path)["kind"])
             good = path.name not in known or files.file_sha256(path) == known[path.name]["sha256"]

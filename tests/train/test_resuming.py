@@ -8,19 +8,18 @@ import pathlib
 import signal
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.loop import TrainConfig, fit
 from dipn_jax.train.push import PushTask
-from flax import nnx
 
 from dipn_jax import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import checkpoint
+from experiments.faults_run import arrays_of
 
 BRIEF = TrainConfig(steps=6, batch=4, eval_every=3, save_every=3)
 NAMES = ("push", "grasp-pretrain", "grasp")
@@ -33,20 +32,12 @@ def _task(name: str, data: dict[str, pathlib.Path]) -> Any:
     return PretrainTask(data["images"], network) if name == "grasp-pretrain" else GraspTask((data["grasp"],), network)
 
 
-def _state(run: pathlib.Path, task: Any) -> list[np.ndarray]:
+def _state(run: pathlib.Path) -> list[np.ndarray]:
     """Return all arrays of a run's newest step: weights, and what only training needs."""
     folder, _ = checkpoint.newest(run)  # type: ignore[misc]
-    arrays = [checkpoint.numpy_arrays((folder / part).resolve()) for part in ("model", "train")]
-    assert len(arrays[1]) > 2
-    network = checkpoint.load_network(run, network=task.network)
-    return [
-        *(part[key] for part in arrays for key in sorted(part)),
-        *map(np.asarray, jax.tree.leaves(_weights(network))),
-    ]
-
-
-def _weights(model: nnx.Module) -> Any:
-    return nnx.state(model, nnx.Param)
+    model, train = (arrays_of(folder / part) for part in ("model", "train"))
+    assert len(model) > 2 and len(train) > 2
+    return [*model.values(), *train.values()]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,7 +62,7 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(
     assert checkpoint.newest(tmp_path / "cut")[1]["step"] == 4  # type: ignore[index]
     fit(task, BRIEF, tmp_path / "cut")
     assert calls == 6, "no step is repeated"
-    for a, b in zip(_state(tmp_path / "whole", task), _state(tmp_path / "cut", task), strict=True):
+    for a, b in zip(_state(tmp_path / "whole"), _state(tmp_path / "cut"), strict=True):
         np.testing.assert_array_equal(a, b)
     lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "cut")]
     assert lines[0] == lines[1]
