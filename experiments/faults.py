@@ -21,7 +21,7 @@ from typing import Any
 
 from dipn_jax import console, files, machine
 from dipn_jax.errors import UserError
-from experiments import faults_run, reliability
+from experiments import faults_run, pages, reliability
 from experiments.faults_run import Case, Kind, Point
 from experiments.mutants_session import ROOT, STAGES
 
@@ -86,7 +86,9 @@ def count(cases: Sequence[Case], out: pathlib.Path, code: str) -> dict[tuple[str
     """Return the calls that can be disturbed by case and kind; counted once for these sources."""
     path = out / "calls.json"
     kept = files.read_json(path) if path.exists() else {}
-    kept = kept if kept.get("code") == code else {"code": code}
+    if kept.get("code") != code:
+        kept = {"code": code}
+        shutil.rmtree(out / "whole", ignore_errors=True)
     for case in cases:
         if case.name not in kept:
             faults_run.reference(case, out)
@@ -145,13 +147,17 @@ def _work(options: argparse.Namespace) -> int:
     with console.Progress("faults", len(points), unit="faults") as progress:
         for point in points:
             _try(point, by_name[point.case], out, code)
+            _write_page(out, code)
             progress.advance(1)
-    tried = [files.read_json(path) for path in sorted((out / "points").glob("*.json"))]
-    current = [each for each in tried if each["code"] == code]
-    reliability.write(
-        "faults", summary(current) | {"made": {"commit": machine.commit(), "processor": machine.processor()}}
-    )
     return 0
+
+
+def _write_page(out: pathlib.Path, code: str) -> None:
+    """Write what has been found with these sources so far, also of other commands, to the page."""
+    tried = [files.read_json(path) for path in sorted((out / "points").glob("*.json"))]
+    found = summary([each for each in tried if each["code"] == code])
+    made = {"commit": machine.commit(), "processor": machine.processor()}
+    reliability.write("faults", found | {pages.MADE: made})
 
 
 def _try(point: Point, case: Case, out: pathlib.Path, code: str) -> None:
