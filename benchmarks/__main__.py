@@ -48,6 +48,11 @@ BENCHMARKS = {
     "push_net.input_share": Benchmark(
         "share of a training step of the compact DIPN that its inputs take", "<= 0.2", "push_net:input_share"
     ),
+    "train.saving": Benchmark(
+        "seconds a step of training with checkpoints over without, in the background and in line",
+        "<= 1.03",
+        "saving:cost",
+    ),
     "push_net.batched": Benchmark("64 candidate pushes in one call over a call for each", "none", "push_net:batched"),
     "bench_grasp.compact_vs_torch_paper": Benchmark(
         "seconds of all scores of an image, compact GN over the published one in PyTorch",

@@ -37,7 +37,7 @@ USES = 64
 """Number of times that a training of 3,000 steps uses each of 1,500 pushes."""
 
 
-def _task(folder: str, preset: str, seed: int) -> PushTask:
+def small_task(folder: str, preset: str, seed: int) -> PushTask:
     """Return a training task on a small data set of 1 to 7 objects."""
     data = pathlib.Path(folder) / "data"
     with quiet():
@@ -62,7 +62,7 @@ def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
         raise Skipped("PyTorch is not installed; run pip install torch (the extra `bench`)")
     for preset, batch in BATCHES.items():
         with tempfile.TemporaryDirectory() as name:
-            task = _task(name, preset, setting.seed)
+            task = small_task(name, preset, setting.seed)
             examples = task.prepare(structs.take(task.train_set, np.arange(batch)))
             arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
             file = pathlib.Path(name) / "examples.npz"
@@ -80,7 +80,7 @@ def input_share(setting: Setting) -> Iterator[tuple[str, float]]:
     """
     batch = BATCHES["compact"]
     with tempfile.TemporaryDirectory() as name:
-        task = _task(name, "compact", setting.seed)
+        task = small_task(name, "compact", setting.seed)
     rows = np.arange(batch)
     episodes = structs.take(task.train_set, rows)
     model = checkpoint.build("dipn", task.network_config)

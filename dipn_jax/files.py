@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import functools
 import hashlib
 import importlib.metadata
@@ -78,18 +79,39 @@ def file_sha256(path: pathlib.Path) -> str:
 
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
-    """Write a file under a temporary name, sync it, then rename it."""
+    """Write a file under a temporary name, then `move` it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # workers in containers may share process numbers
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
-        with temporary.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.rename(path)
+        temporary.write_bytes(data)
+        move(temporary, path)
+    except OSError as error:  # a write that fails does not say where
+        raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def move(source: pathlib.Path, target: pathlib.Path) -> None:
+    """Rename a file or a folder so that a power cut leaves all of it or nothing: first its content is synced, then its
+    name.
+    """
+    for path in (*source.rglob("*"), source):
+        _sync(path)
+    source.rename(target)
+    _sync(target.parent)
+
+
+def _sync(path: pathlib.Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on the disk; some file systems sync no folders."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if not path.is_dir() or error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def read_text(path: pathlib.Path) -> str:

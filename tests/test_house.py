@@ -171,6 +171,17 @@ def test_nothing_is_pickled() -> None:
                     assert said.get("allow_pickle") == "False", f"{path}: {ast.unparse(call)}"
 
 
+def test_files_are_renamed_in_one_place() -> None:
+    """`files.move` syncs what it renames, and the folder afterwards."""
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            called = {
+                ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
+            }
+            renaming = {name for name in called if name.endswith(".rename") or name in ("os.replace", "shutil.move")}
+            assert not renaming or path == ROOT / "dipn_jax" / "files.py", f"{path}: {renaming}"
+
+
 def _pins() -> dict[str, str]:
     """Versions of `constraints.txt`."""
     return dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines())

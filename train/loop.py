@@ -19,7 +19,7 @@ from flax import nnx
 from dipn_jax import console, files, seeds
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import Interruption
-from dipn_jax.storage import checkpoint, owner
+from dipn_jax.storage import checkpoint, owner, saving
 
 from . import finite
 from .configs import BaselineConfig, OnlineConfig, TrainConfig
@@ -160,26 +160,20 @@ def _fit(
 
     def save(step: int) -> None:
         parts = {"model": nnx.state(nnx.merge(graph, params, rest)), "train": moments}
-        checkpoint.save(
-            out,
-            step,
-            parts,
-            network=task.network,
-            config=task.network_config,
-            extra={"seed": config.seed, "data": task.fingerprint, "examples": task.examples, **latest},
-        )
+        about = {"seed": config.seed, "data": task.fingerprint, "examples": task.examples, **latest}
+        saver.save(step, parts, extra=about)
 
-    step = begin
+    step, saver = begin, saving.Saver(out, network=task.network, config=task.network_config)
     progress = console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin)
-    with progress, Interruption() as interruption:
+    with progress, Interruption() as interruption, saver:
         while step < config.steps:
             batch = task.fetch(np.asarray(order[step]))
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
             watch.see(step, loss)
             step += 1
             evaluating = step % config.eval_every == 0 or step == config.steps
-            saving = step % config.save_every == 0 or step == config.steps or interruption.requested
-            if evaluating or saving:
+            due = step % config.save_every == 0 or step == config.steps or interruption.requested
+            if evaluating or due:
                 watch.check(step, (params, rest, moments))
             if evaluating:
                 model = nnx.merge(graph, params, rest)
@@ -187,9 +181,10 @@ def _fit(
                 latest = {"loss": float(loss), **task.evaluate(model)}
                 watch.check(step, params, **latest)
                 log.write(step, latest)
-            if saving or interruption.requested:
+            if due or interruption.requested:
                 save(step)
             if interruption.requested:
+                saver.wait()
                 raise KeyboardInterrupt
             progress.advance(1, " ".join(f"{k} {v:.3f}" for k, v in latest.items()))
     log.close()

@@ -80,7 +80,7 @@ def save(
     try:
         _write(temporary, parts, about, extra)
         shutil.rmtree(final, ignore_errors=True)
-        temporary.rename(final)
+        files.move(temporary, final)
     finally:
         files.remove_folder(temporary)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
@@ -206,20 +206,20 @@ def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(target), leaves)
 
 
-def _is_key(leaf: Any) -> bool:
+def is_key(leaf: Any) -> bool:
     """Return whether a leaf is a random key (dropout's), which is stored as its numbers."""
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _stored_shape(leaf: Any) -> tuple[int, ...]:
     """Return the shape that a leaf is stored in."""
-    return np.shape(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+    return np.shape(jax.random.key_data(leaf) if is_key(leaf) else leaf)
 
 
 def _on_device(stored: np.ndarray, *, like: Any) -> jax.Array:
     """Return a copy of `stored` on the default device (training donates its buffers); a random key if `like` is one."""
     array = jnp.array(stored)
-    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if _is_key(like) else array
+    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if is_key(like) else array
 
 
 def digest(model: nnx.Module) -> str:

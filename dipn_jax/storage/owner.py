@@ -1,4 +1,4 @@
-"""One owner at a time for a run's folder: who has it stands in `OUT/owner.json` while it works."""
+"""One owner at a time for the folder of a run or an evaluation: who has it stands in `OUT/owner.json` meanwhile."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ from dipn_jax.errors import UserError
 def owned(out: pathlib.Path) -> Iterator[None]:
     """Own a folder, which is made if need be, within a `with` statement; dead processes' temporary files are deleted.
 
+    A folder that was made and is still empty at the end is deleted.
+
     The file is locked, so that it is free once its owner is dead; where files cannot be locked, it is made exclusively,
     and an owner of this host is looked for.
 
     Raises:
       UserError: somebody else has it.
     """
+    made = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     descriptor, path = _locked(out / "owner.json")
     try:
@@ -38,6 +41,9 @@ def owned(out: pathlib.Path) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         os.close(descriptor)
+        if made:
+            with contextlib.suppress(OSError):  # there is something in it
+                out.rmdir()
 
 
 def _locked(path: pathlib.Path) -> tuple[int, pathlib.Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import pathlib
@@ -41,12 +42,25 @@ def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """List every readable shard of the folder in `manifest.json`, and return the manifest.
 
     Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
-    folder take turns, where the system can lock files (Windows cannot by `fcntl`: there, one worker to a folder).
+    folder take turns, where the system can lock files. Where it cannot, the last one to write looks again whether
+    shards were added while it wrote, so that none stays unlisted.
     """
     with (folder / ".lock").open("wb") as lock:
-        if fcntl is not None:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        return _rebuild_manifest(folder)
+        try:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        except OSError:
+            _warn_of_no_locks(folder)
+        manifest = _rebuild_manifest(folder)
+        while set(manifest["shards"]) != {path.name for path in shards.shard_files(folder)}:
+            manifest = _rebuild_manifest(folder)  # somebody whom no lock kept waiting has added a shard
+        return manifest
+
+
+@functools.cache
+def _warn_of_no_locks(folder: pathlib.Path) -> None:
+    """Say once a process that workers cannot take turns."""
+    console.warn(f"{folder}: its file system has no locks; workers list their shards without taking turns")
 
 
 def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
@@ -135,7 +149,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     removed = []
     for path in shards.shard_files(folder):
         if not _good(path, known.get(path.name)):
-            path.rename(path.with_suffix(".parquet.damaged"))
+            files.move(path, path.with_suffix(".parquet.damaged"))
             removed.append(path)
     (folder / MANIFEST).unlink(missing_ok=True)
     update_manifest(folder)

@@ -87,16 +87,20 @@ def clear(
 
     Returns:
       The metrics.
+
+    Raises:
+      UserError: another process has the folder.
     """
-    from dipn_jax.storage import resume
+    from dipn_jax.storage import owner, resume
 
     from . import lockstep
 
     seed = given["seed"]
     partial: resume.Partial = resume.Partial(out, given, inputs=inputs(runs, tables))
-    instances = tables.make(physics, seed=seed)
-    ended = lockstep.clear(instances, physics, decide, partial, seed=seed, longest=longest, remember=remember)
-    lockstep.save(ended, out)
-    values = lockstep.summary(ended)
-    options.finish(out, values, given, partial)
+    with owner.owned(out):
+        instances = tables.make(physics, seed=seed)
+        ended = lockstep.clear(instances, physics, decide, partial, seed=seed, longest=longest, remember=remember)
+        lockstep.save(ended, out)
+        values = lockstep.summary(ended)
+        options.finish(out, values, given, partial)
     return values

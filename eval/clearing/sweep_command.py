@@ -62,7 +62,7 @@ def sweep(
     given = evaluation.settings(locals()) | {"method": "dipn+gn", "label": ""}
     from dipn_jax.physics import make_engine
     from dipn_jax.planning.methods import Networks, PolicyConfig
-    from dipn_jax.storage import resume
+    from dipn_jax.storage import owner, resume
 
     from .. import metrics
     from . import sweeping
@@ -75,12 +75,13 @@ def sweep(
     configs[sweeping.CHOSEN] = chosen
     networks, physics = Networks(push_net, grasp_net), make_engine(engine, threads=threads)
     kept = resume.Partial(out, given, inputs=evaluation.inputs(networks.runs("dipn+gn"), tables))
-    values = _clear_with_each(out, configs, networks, physics, tables, camera, given=given, kept=kept)
-    if pushes:
-        values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
-    sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
-    metrics.write(out, values, settings=options.recorded(given, kept))
-    kept.finish()
+    with owner.owned(out):
+        values = _clear_with_each(out, configs, networks, physics, tables, camera, given=given, kept=kept)
+        if pushes:
+            values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
+        sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
+        metrics.write(out, values, settings=options.recorded(given, kept))
+        kept.finish()
     console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
 
 

@@ -62,7 +62,7 @@ def grasp(
         raise UserError("grasp: nothing to measure; give --grasp-net or --curve")
     from dipn_jax.physics import make_engine
     from dipn_jax.planning import scorers
-    from dipn_jax.storage import checkpoint, resume
+    from dipn_jax.storage import checkpoint, owner, resume
     from dipn_jax.world import scenes
 
     from .. import curves
@@ -75,22 +75,23 @@ def grasp(
     values: dict[str, Any] = curves.grasp_summary(curves.load_grasp_runs(curve))
     if run:
         physics, scorer = make_engine(engine, threads=threads), scorers.load_scorer(run, aids=aids)
-        found, tables = success.evaluate(
-            scorer,
-            physics,
-            config,
-            partial,
-            scenes=scenes_,
-            seed=seed,
-            others=others,
-            camera=camera,
-            aids=aids,
-        )
-        alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
-        values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
-        lockstep.save(tables, out)
-        success.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
-    if curve:
-        out.mkdir(parents=True, exist_ok=True)
-        curves.grasp_figure(values).savefig(out / "curve.png", dpi=130)
-    options.finish(out, values, settings, partial)
+    with owner.owned(out):
+        if run:
+            found, tables = success.evaluate(
+                scorer,
+                physics,
+                config,
+                partial,
+                scenes=scenes_,
+                seed=seed,
+                others=others,
+                camera=camera,
+                aids=aids,
+            )
+            alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
+            values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
+            lockstep.save(tables, out)
+            success.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
+        if curve:
+            curves.grasp_figure(values).savefig(out / "curve.png", dpi=130)
+        options.finish(out, values, settings, partial)

@@ -57,7 +57,7 @@ def predict(
     if not push_net and not curve:
         raise UserError("prediction: nothing to measure; give --push-net or --curve")
     from dipn_jax.physics import make_engine
-    from dipn_jax.storage import resume
+    from dipn_jax.storage import owner, resume
     from dipn_jax.world import scenes
 
     from .. import curves
@@ -66,20 +66,15 @@ def predict(
     config = scenes.parse_objects(objects, ranges=ranges)
     networks, compared, runs = _load(push_net, curve)
     partial = resume.Partial(out, settings, inputs=runs)
-    values, films = push_errors.evaluate(
-        networks,
-        make_engine(engine, threads=threads),
-        config,
-        partial,
-        scenes=scenes_,
-        seed=seed,
-        physics=physics,
-        segmented=segmented,
-    )
-    kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in compared)}
-    values = kept | curves.push_summary(values, compared)
-    _save_pictures(out, films, values, curve=bool(curve))
-    options.finish(out, values, settings, partial)
+    truth = make_engine(engine, threads=threads)
+    with owner.owned(out):
+        values, films = push_errors.evaluate(
+            networks, truth, config, partial, scenes=scenes_, seed=seed, physics=physics, segmented=segmented
+        )
+        kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in compared)}
+        values = kept | curves.push_summary(values, compared)
+        _save_pictures(out, films, values, curve=bool(curve))
+        options.finish(out, values, settings, partial)
 
 
 def _load(
@@ -109,7 +104,6 @@ def _save_pictures(out: pathlib.Path, films: dict[str, np.ndarray], values: dict
 
     from .. import curves
 
-    out.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(out / "films.npz", allow_pickle=False, **films)
     for which in ("all", "moved") if curve else ():
         curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)

@@ -1,4 +1,6 @@
 import dataclasses
+import errno
+import fcntl
 import json
 import pathlib
 import shutil
@@ -159,3 +161,23 @@ def test_invalid_options_are_refused(tmp_path: pathlib.Path) -> None:
     with pytest.raises(UserError, match="--shard 2 --of 2"):
         generate(JOB, tmp_path / "x", part=2, of=2)
     assert not (tmp_path / "x").exists()
+
+
+def test_without_locks_a_data_set_is_made_all_the_same_with_one_line(
+    copy: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """NFS and Lustre may refuse locks; both shards of this data set are made side by side."""
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    out = tmp_path / "new"
+    generate(JOB, out)
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if "warning" in line] == [
+        f"warning: {out}: its file system has no locks; workers list their shards without taking turns"
+    ]
+    assert records.verify(out) == []
+    for path in copy.glob("*.parquet"):
+        assert (out / path.name).read_bytes() == path.read_bytes()

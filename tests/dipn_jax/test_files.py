@@ -1,8 +1,10 @@
 """Text files: UTF-8 with or without a byte-order mark, whatever the locale says."""
 
+import errno
 import json
 import os
 import pathlib
+import stat
 import subprocess
 import sys
 
@@ -89,3 +91,61 @@ def test_a_line_of_a_log_that_does_not_fit_is_named(text: str, tmp_path: pathlib
     path.write_text(text)
     with pytest.raises(files.UserError, match=r"metrics\.jsonl: damaged, line 2"):
         files.read_lines(path, wanted={"a": float})
+
+
+def _recorded(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Return a list that fills with what is synced (`sync`, name) and renamed (`rename`, new name), in order."""
+    did: list[tuple[str, str]] = []
+    sync, rename = os.fsync, pathlib.Path.rename
+
+    def synced(descriptor: int) -> None:
+        sync(descriptor)
+        did.append(("sync", pathlib.Path(os.readlink(f"/proc/self/fd/{descriptor}")).name))
+
+    def renamed(self: pathlib.Path, target: pathlib.Path) -> pathlib.Path:
+        did.append(("rename", target.name))
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(pathlib.Path, "rename", renamed)
+    return did
+
+
+def test_content_is_synced_before_a_rename_and_the_name_after_it(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    did = _recorded(monkeypatch)
+    files.write_text(tmp_path / "a.txt", "a")
+    assert did[0][0] == "sync" and did[0][1].startswith(".a.txt.")
+    assert did[1:] == [("rename", "a.txt"), ("sync", tmp_path.name)]
+    did.clear()
+    (tmp_path / "new" / "inner").mkdir(parents=True)
+    (tmp_path / "new" / "inner" / "b").touch()
+    files.move(tmp_path / "new", tmp_path / "old")
+    at = did.index(("rename", "old"))
+    assert sorted(did[:at]) == [("sync", "b"), ("sync", "inner"), ("sync", "new")]
+    assert did[at + 1 :] == [("sync", tmp_path.name)]
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EIO])
+def test_a_file_system_that_syncs_no_folders_is_put_up_with(
+    number: int, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error of another kind is not, and no error of a file."""
+    refused = {"folder": True}
+
+    def refuse(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode) == refused["folder"]:
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    if number == errno.EIO:
+        with pytest.raises(OSError, match=r"a\.txt"):
+            files.write_text(tmp_path / "a.txt", "a")
+        return
+    files.write_text(tmp_path / "a.txt", "a")
+    assert (tmp_path / "a.txt").read_text() == "a"
+    refused["folder"] = False
+    with pytest.raises(OSError, match=r"b\.txt"):
+        files.write_text(tmp_path / "b.txt", "b")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]

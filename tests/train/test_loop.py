@@ -2,7 +2,6 @@ import dataclasses
 import json
 import os
 import pathlib
-import signal
 from typing import Any
 
 import jax
@@ -35,34 +34,6 @@ def task(data: dict[str, pathlib.Path]) -> PushTask:
 
 def _weights(run: pathlib.Path) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(nnx.state(checkpoint.load_network(run, network="dipn")))]
-
-
-def test_an_interrupted_run_ends_as_an_uninterrupted_one(
-    task: PushTask, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fit(task, BRIEF, tmp_path / "whole")
-    calls = 0
-    fetch = task.fetch
-
-    def interrupt(index: np.ndarray) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == 4:
-            os.kill(os.getpid(), signal.SIGTERM)  # the current step is finished first
-        return fetch(index)
-
-    monkeypatch.setattr(task, "fetch", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        fit(task, BRIEF, tmp_path / "cut")
-    assert checkpoint.newest(tmp_path / "cut")[1]["step"] == 4  # type: ignore[index]
-    fit(task, BRIEF, tmp_path / "cut")
-    assert calls == 6, "no step is repeated"
-    for a, b in zip(_weights(tmp_path / "whole"), _weights(tmp_path / "cut"), strict=True):
-        np.testing.assert_array_equal(a, b)
-    lines = [(tmp_path / run / "metrics.jsonl").read_text() for run in ("whole", "cut")]
-    assert lines[0] == lines[1]
-    assert [json.loads(line)["step"] for line in lines[0].splitlines()] == [3, 6]
-    assert list((tmp_path / "cut" / "events").iterdir())
 
 
 def test_a_folder_belongs_to_one_run(task: PushTask, tmp_path: pathlib.Path) -> None:

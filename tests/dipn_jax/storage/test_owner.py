@@ -49,6 +49,7 @@ def test_without_locks_the_file_is_made_exclusively_and_that_is_said(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(fcntl, "flock", _no_locks)
+    (tmp_path / "run").mkdir()
     with owner.owned(tmp_path / "run"):
         assert "no locks" in capsys.readouterr().err
         with pytest.raises(UserError, match=f"pid {os.getpid()}"), owner.owned(tmp_path / "run"):

@@ -1,3 +1,5 @@
+import errno
+import fcntl
 import json
 import pathlib
 import shutil
@@ -166,3 +168,24 @@ def test_where_files_cannot_be_locked_the_manifest_is_written_all_the_same(tmp_p
     )
     subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
     assert (tmp_path / records.MANIFEST).is_file()
+
+
+def _no_locks(*_: object) -> None:
+    raise OSError(errno.ENOLCK, "No locks available")
+
+
+def test_without_locks_a_shard_that_comes_while_the_manifest_is_written_is_listed(
+    copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fcntl, "flock", _no_locks)
+    late = shards.shard_path(copy, 1)
+    content, write = late.read_bytes(), files.write_json
+    late.unlink()
+
+    def slow(path: pathlib.Path, value: object) -> None:
+        late.write_bytes(content)  # by another worker, who is quicker
+        write(path, value)
+
+    monkeypatch.setattr(files, "write_json", slow)
+    assert set(records.update_manifest(copy)["shards"]) == {"shard-00000.parquet", late.name}
+    assert records.verify(copy) == []

@@ -1,0 +1,267 @@
+"""The page of what runs survive: promises, the tests that hold them, and counts of what was tried.
+
+    python -m experiments.reliability             # damages a checkpoint in every way and writes the page anew
+
+The counts are in `docs/reliability.json`: `faults` by `experiments.faults`, `fuzz` by `experiments.fuzz`, `checkpoints`
+by this module.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import pathlib
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from dipn_jax import console, files
+from dipn_jax.errors import UserError
+from experiments import pages
+
+PAGE = "reliability"
+"""Name of the page in docs and of its JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Promise:
+    """Something that a user can rely on."""
+
+    text: str
+    tests: tuple[str, ...]  # file::name
+    counted: Callable[[dict[str, Any]], str] = lambda _: ""  # what was tried, from the page's JSON
+
+
+def _faults(values: dict[str, Any]) -> str:
+    rows = [row for case in cases_of(values).values() for row in case.values()]
+    if not rows:
+        return "not run"
+    total = {name: sum(row[name] for row in rows) for name in rows[0]}
+    return (
+        f"{total['tried']} faults: {total['lost']} records lost, {total['repeated']} repeated, {total['wrong']} "
+        f"results wrong, {total['damaged']} files damaged, {total['tracebacks']} tracebacks"
+    )
+
+
+def _fuzz(values: dict[str, Any]) -> str:
+    found = values.get("fuzz", {}).values()
+    if not found:
+        return "not run"
+    inputs, tracebacks = (sum(each[name] for each in found) for name in ("inputs", "tracebacks"))
+    return f"{inputs:,} inputs: {tracebacks:,} tracebacks"
+
+
+def _checkpoints(values: dict[str, Any]) -> str:
+    found = values.get("checkpoints")
+    return f"{found['damaged']} damaged: {found['recovered']} runs went on with the step before" if found else "not run"
+
+
+_STORAGE = "tests/dipn_jax/storage"
+PROMISES = (
+    Promise(
+        "A command that is killed, or whose disk is full, loses no record that it has finished; given again, it ends "
+        "as if nothing had happened.",
+        (
+            "tests/experiments/test_faults.py::test_a_command_given_again_after_a_fault_ends_as_an_undisturbed_one",
+            "tests/datagen/test_generate.py::test_a_gap_is_filled_with_the_same_bytes_and_the_rest_left_alone",
+        ),
+        _faults,
+    ),
+    Promise(
+        "A file or a step that has its name is whole, after a power cut, too: content is synced, then renamed, then "
+        "the folder is synced.",
+        (
+            "tests/dipn_jax/test_files.py::test_content_is_synced_before_a_rename_and_the_name_after_it",
+            "tests/test_house.py::test_files_are_renamed_in_one_place",
+            f"{_STORAGE}/test_saving.py::test_a_step_has_its_name_only_when_it_is_synced",
+        ),
+    ),
+    Promise(
+        "A training that was stopped and goes on ends bit for bit as one that was not (on a CPU).",
+        (
+            "tests/train/test_resuming.py::test_an_interrupted_run_ends_as_an_uninterrupted_one",
+            "tests/train/test_loop.py::test_learning_online_continues_where_it_was_stopped",
+            "tests/train/test_baseline.py::test_an_interrupted_run_continues_to_the_same_end",
+        ),
+    ),
+    Promise(
+        "A step of a run that was damaged later is noticed, named and passed over for the one before.",
+        (
+            f"{_STORAGE}/test_checkpoint.py::test_a_damaged_step_is_skipped",
+            f"{_STORAGE}/test_checkpoint.py::test_a_damaged_newest_step_is_named_once_with_the_step_used",
+            "tests/experiments/test_reliability.py::test_every_kind_of_damage_is_noticed",
+        ),
+        _checkpoints,
+    ),
+    Promise(
+        "Checkpoints are written while training goes on: what it does meanwhile does not get into them, the last one "
+        "is waited for, and one that cannot be written is one line and exit code 2.",
+        (
+            f"{_STORAGE}/test_saving.py::test_what_is_donated_or_changed_while_a_step_is_written_does_not_change_it",
+            f"{_STORAGE}/test_saving.py::test_one_step_is_written_at_a_time_and_the_last_is_waited_for",
+            "tests/train/test_resuming.py::test_a_step_that_cannot_be_saved_ends_the_run_with_one_line",
+        ),
+    ),
+    Promise(
+        "A damaged shard is named, set aside by `dipn-datagen repair` and made again with the same bytes.",
+        (
+            f"{_STORAGE}/test_records.py::test_a_damaged_shard_is_named_and_repaired",
+            "tests/test_commands.py::test_a_truncated_shard",
+        ),
+    ),
+    Promise(
+        "A file of the user's that is damaged or strange is one line and exit code 2, not a traceback.",
+        (
+            "tests/test_commands.py::test_an_unknown_shape_in_a_case_file",
+            "tests/dipn_jax/test_files.py::test_a_file_that_is_no_utf8_is_damaged",
+        ),
+        _fuzz,
+    ),
+    Promise(
+        "A folder of a training or an evaluation has one owner at a time; a second one is told who has it.",
+        (
+            f"{_STORAGE}/test_owner.py::test_the_second_is_told_who_has_it_and_a_dead_owner_does_not_block",
+            "tests/train/test_loop.py::test_a_run_that_is_going_on_is_not_started_again",
+            "tests/eval/test_owned.py::test_a_second_evaluation_into_a_folder_is_told_who_has_it",
+        ),
+    ),
+    Promise(
+        "Where a file system has no locks, data sets are made, runs trained and tables cleared all the same, with one "
+        "line of warning.",
+        (
+            "tests/datagen/test_generate.py::test_without_locks_a_data_set_is_made_all_the_same_with_one_line",
+            f"{_STORAGE}/test_records.py::"
+            "test_without_locks_a_shard_that_comes_while_the_manifest_is_written_is_listed",
+            f"{_STORAGE}/test_owner.py::test_without_locks_the_file_is_made_exclusively_and_that_is_said",
+        ),
+    ),
+)
+"""What runs promise, the tests that fail where it is broken, and what was counted."""
+
+
+def cases_of(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the counts of faults by command and kind, from the page's JSON."""
+    return {name: found for name, found in values.get("faults", {}).items() if name != pages.MADE}
+
+
+def section(values: dict[str, Any]) -> str:
+    """Return the tables of the page as Markdown, from its JSON."""
+    lines = ["| promise | held by | tried |", "| --- | --- | --- |"]
+    for promise in PROMISES:
+        tests = "<br>".join(f"`{test}`" for test in promise.tests)
+        lines.append(f"| {promise.text} | {tests} | {promise.counted(values)} |")
+    columns = ("tried", "lost", "repeated", "wrong", "damaged", "tracebacks")
+    lines += ["", f"| command | fault | {' | '.join(columns)} |", f"| --- | --- |{' --- |' * len(columns)}"]
+    for case, kinds in cases_of(values).items():
+        for kind, row in kinds.items():
+            lines.append(f"| {case} | {kind} | {' | '.join(str(row[name]) for name in columns)} |")
+    return "\n".join(lines) + "\n"
+
+
+def write(key: str, found: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
+    """Put what an experiment found into `reliability.json` under its key, and the tables into `reliability.md`."""
+    path, page = docs / f"{PAGE}.json", docs / f"{PAGE}.md"
+    values = (files.read_json(path) if path.exists() else {}) | {key: found}
+    text = pages.with_tables(files.read_text(page), section(values))
+    files.write_json(path, values)
+    files.write_text(page, text)
+
+
+def _flip(path: pathlib.Path) -> None:
+    content = bytearray(path.read_bytes())
+    if content:
+        content[len(content) // 2] ^= 1
+    path.write_bytes(bytes(content) or b"x")
+
+
+def _cut(path: pathlib.Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2] if content else b"x")
+
+
+def _zero(path: pathlib.Path) -> None:
+    path.write_bytes(bytes(max(1, path.stat().st_size)))
+
+
+WAYS: dict[str, Callable[[pathlib.Path], None]] = {
+    "a bit flipped": _flip,
+    "cut in half": _cut,
+    "deleted": pathlib.Path.unlink,
+    "zeros": _zero,
+}
+"""Ways to damage a file; one that is empty becomes longer."""
+
+
+def damage(run: pathlib.Path, ways: Sequence[str] = tuple(WAYS)) -> dict[str, int]:
+    """Damage every file of a run's newest step in every way, one at a time, and count after how many the run goes on.
+
+    Args:
+      run: a run of GN with two steps; it is changed and mended again.
+      ways: keys of WAYS.
+
+    Returns:
+      `damaged`, how often that was done, and `recovered`, how often the step before was loaded instead.
+    """
+    from dipn_jax.storage import checkpoint
+
+    newest, before = sorted((run / "checkpoints").iterdir(), reverse=True)
+    kept = run / "kept"
+    shutil.copytree(newest, kept)
+    wanted = checkpoint.digest(checkpoint.load_network(before, network="grasp"))
+    count = {"damaged": 0, "recovered": 0}
+    for path in sorted(path for path in newest.rglob("*") if path.is_file()):
+        for way in ways:
+            WAYS[way](path)
+            count["damaged"] += 1
+            try:
+                found = checkpoint.digest(checkpoint.load_network(run, network="grasp"))
+            except UserError:
+                found = ""
+            count["recovered"] += found == wanted
+            shutil.copy(kept / path.relative_to(newest), path)
+    shutil.rmtree(kept)
+    return count
+
+
+def two_steps(run: pathlib.Path) -> None:
+    """Write a run of a small GN with two steps."""
+    from flax import nnx
+
+    from dipn_jax.networks.grasp import GraspConfig
+    from dipn_jax.storage import checkpoint
+
+    config = GraspConfig(width=8, coarse=8, blocks=1)
+    for step in (1, 2):
+        parts = {"model": nnx.state(checkpoint.build("grasp", config, seed=step))}
+        checkpoint.save(run, step, parts, network="grasp", config=config, extra={})
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.reliability",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--dry-run", action="store_true", help="show the promises")
+    options = parser.parse_args(arguments)
+    return console.exit_code(lambda: _work(options))
+
+
+def _work(options: argparse.Namespace) -> int:
+    if options.dry_run:
+        for promise in PROMISES:
+            console.say(promise.text)
+        return 0
+    with tempfile.TemporaryDirectory() as folder:
+        two_steps(pathlib.Path(folder))
+        found = damage(pathlib.Path(folder))
+    write("checkpoints", found)
+    console.say(f"checkpoints: {found['recovered']} of {found['damaged']}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""Faults: they are spread over all calls, counted rightly, and a few of them are tried here."""
+
+import os
+import pathlib
+
+import numpy as np
+import pytest
+
+from dipn_jax.storage import shards
+from experiments import faults, faults_run
+from experiments.faults_run import Case, Point, Result
+
+SMALL = Case("generate", (*faults.CASES[0].words[:2], "--episodes", "2", "--shard-size", "1", *faults._FEW))
+
+
+def test_faults_are_spread_over_all_calls_of_every_command() -> None:
+    counts = {("a", "killed"): 3, ("a", "full"): 100, ("b", "killed"): 0}
+    points = faults.spread(counts, 13)
+    assert points == faults.spread(counts, 13) and len(set(points)) == 13
+    by_kind = [sorted(point.when for point in points if point.kind == kind) for kind in ("killed", "full")]
+    assert by_kind[0] == [1, 2, 3] and by_kind[1][0] == 1 and by_kind[1][-1] == 100
+    assert np.diff(by_kind[1]).max() <= 12
+    assert {point.kind for point in points[:2]} == {"killed", "full"}, "the first few are of all kinds"
+    assert len(faults.spread(counts, 1000)) == 103
+
+
+def test_lost_and_repeated_records_are_counted() -> None:
+    whole = Result(["a", "b", "b"], {"x": "1"})
+    assert faults_run.compare(whole, whole) == {"lost": 0, "repeated": 0, "wrong": 0}
+    assert faults_run.compare(Result(["a", "a", "a", "b"], {"x": "2"}), whole) == {"lost": 1, "repeated": 2, "wrong": 1}
+    assert faults_run.compare(Result([], {"x": "1"}), whole) == {"lost": 3, "repeated": 0, "wrong": 0}
+
+
+def test_counts_are_added_by_command_and_kind() -> None:
+    none = dict.fromkeys(faults.COUNTED, 0)
+    tried = [{"case": "a", "kind": "k", "reached": reached, **none, "lost": 2} for reached in (1, 0, 1)]
+    assert faults.summary(tried) == {"a": {"k": {"tried": 2, **none, "lost": 6}}}
+
+
+def test_a_file_that_is_not_whole_is_noticed(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    whole = faults_run.result(data["push"])
+    assert len(whole.records) == len(set(whole.records)) == 24 and "shard-00001.parquet" in whole.digests
+    path = shards.shard_path(tmp_path, 1)
+    path.write_bytes(shards.shard_path(data["push"], 1).read_bytes())
+    (tmp_path / ".shard-00000.parquet.1-a.tmp").write_bytes(b"half")
+    assert faults_run.damaged(tmp_path, whole) == []
+    path.write_bytes(path.read_bytes()[:-1])
+    (tmp_path / "manifest.json").write_text('{"shards')
+    assert faults_run.damaged(tmp_path, whole) == [path.name, "manifest.json"]
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """Return a folder of the experiment that shares the tests' compiled programs."""
+    if reason := faults_run.can_trace():
+        pytest.skip(reason)
+    folder = tmp_path_factory.mktemp("faults")
+    (folder / "cache").mkdir()
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    (folder / "cache" / "dipn-jax").symlink_to(pathlib.Path(home) / "dipn-jax")
+    return folder
+
+
+@pytest.mark.parametrize(("kind", "when"), [("killed at a rename", 3), ("disk full at a sync", 4)])
+def test_a_command_given_again_after_a_fault_ends_as_an_undisturbed_one(
+    kind: str, when: int, out: pathlib.Path
+) -> None:
+    whole = faults_run.reference(SMALL, out)
+    assert len(whole.records) == 2
+    found = faults_run.attempt(Point("generate", kind, when), SMALL, faults.KINDS[kind], whole, out=out)
+    assert found["reached"] and found["codes"] == ([2, 0] if "full" in kind else [-9, 0]), found
+    assert not any(found[name] for name in faults.COUNTED), found
+
+
+def test_a_dry_run_lists_commands_and_kinds(capsys: pytest.CaptureFixture[str], tmp_path: pathlib.Path) -> None:
+    assert faults.main(["--dry-run", "--out", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.count("\n") == len(faults.CASES) + len(faults.KINDS)
+    assert list(tmp_path.iterdir()) == []

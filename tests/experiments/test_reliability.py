@@ -1,0 +1,62 @@
+"""The page of what runs survive: its tests exist, its tables are those of the kept counts, and damage is counted."""
+
+import ast
+import pathlib
+import re
+import shutil
+
+import pytest
+
+from dipn_jax import files
+from experiments import pages, reliability
+
+ROOT = pathlib.Path(__file__).parent.parent.parent
+VALUES = {
+    "faults": {
+        "made": {"commit": "abc"},
+        "push": {"killed": {"tried": 3, "lost": 1, "repeated": 0, "wrong": 1, "damaged": 0, "tracebacks": 0}},
+        "clear": {"killed": {"tried": 4, "lost": 0, "repeated": 2, "wrong": 0, "damaged": 0, "tracebacks": 0}},
+    },
+    "fuzz": {"shard": {"inputs": 1000, "tracebacks": 1}, "meta": {"inputs": 500, "tracebacks": 0}},
+    "checkpoints": {"damaged": 8, "recovered": 7},
+}
+
+
+def _kept() -> dict[str, object]:
+    return files.read_json(ROOT / "docs" / "reliability.json")
+
+
+def test_every_test_that_the_page_names_exists() -> None:
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (ROOT / "docs" / "reliability.md").read_text())
+    assert len(named) > 15
+    for file, name in named:
+        tree = ast.parse((ROOT / file).read_text())
+        assert name in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)], f"{file}::{name}"
+
+
+def test_the_tables_in_docs_are_those_of_the_kept_counts() -> None:
+    text = (ROOT / "docs" / "reliability.md").read_text()
+    assert pages.with_tables(text, reliability.section(_kept())) == text
+
+
+def test_the_counts_of_all_commands_are_added() -> None:
+    text = reliability.section(VALUES)
+    said = "7 faults: 1 records lost, 2 repeated, 1 results wrong, 0 files damaged, 0 tracebacks"
+    assert said in text and "1,500 inputs: 1 tracebacks" in text
+    assert "8 damaged: 7 runs went on" in text and "| clear | killed | 4 | 0 | 2 | 0 | 0 | 0 |" in text
+    assert reliability.section({}).count("not run") == 3
+
+
+def test_what_an_experiment_found_is_put_beside_what_others_found(tmp_path: pathlib.Path) -> None:
+    shutil.copy(ROOT / "docs" / "reliability.md", tmp_path)
+    for key in VALUES:
+        reliability.write(key, VALUES[key], docs=tmp_path)
+    assert files.read_json(tmp_path / "reliability.json") == VALUES
+    assert reliability.section(VALUES) in (tmp_path / "reliability.md").read_text()
+
+
+def test_every_kind_of_damage_is_noticed(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    reliability.two_steps(tmp_path)
+    found = reliability.damage(tmp_path, ["a bit flipped", "deleted"])
+    assert found["damaged"] == found["recovered"] > 10
+    assert "damaged; step 1 of" in capsys.readouterr().err
