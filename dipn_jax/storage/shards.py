@@ -30,6 +30,11 @@ KINDS: dict[str, type] = {
     "images": structs.SettledScene,
 }
 """Kinds of data sets, and the struct of their episodes."""
+ROUNDED_START = "rounded"
+"""Entry `start` of the metadata: episodes were simulated from what is stored, so they can be simulated again exactly.
+
+Shards without it are older: their episodes began within half a quantum of what is stored, and contact amplifies that.
+"""
 _META_KEY = b"dipn_jax"
 """Key of our entry in the metadata of a shard."""
 
@@ -69,6 +74,7 @@ def write_shard(
         "columns": specs,
         "config": config,
         "faults": faults,
+        "start": ROUNDED_START,
         "versions": files.package_versions(),
     }
     table = pa.Table.from_arrays(arrays, names=list(columns))
