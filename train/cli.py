@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import sys
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
 
 from dipn_jax import console
 from dipn_jax.names import EngineName
@@ -240,21 +242,30 @@ def _check(out: pathlib.Path, config: OnlineConfig | BaselineConfig) -> None:
 def export(
     run: pathlib.Path,
     out: pathlib.Path,
-    network: Literal["dipn", "grasp"] = "dipn",
+    network: Literal["dipn", "grasp", "vpg"] = "dipn",
+    format_: Annotated[Literal["run", "safetensors"], tyro.conf.arg(name="format")] = "run",
 ) -> None:
-    """Export the weights of a run, a quarter of its size: a run to give to others, whose training cannot be continued.
+    """Export the weights of a run, without what only training needs.
 
+    As a run to give to others, a quarter of its size, whose training cannot be continued:
       dipn-train export --run runs/dipn --out dipn_jax/data/dipn
 
-    Args:
-      run: run folder.
-      out: new run folder.
-      network: the kind of network in it.
-    """
-    from dipn_jax.storage import checkpoint
+    As a file for programs without JAX; its metadata say what the network takes and returns:
+      dipn-train export --run builtin --network grasp --format safetensors --out gn.safetensors
 
-    console.require_out(out)
-    checkpoint.export(run, out, network=network)
+    Args:
+      run: run folder, or builtin.
+      out: new run folder, or the file.
+      network: the kind of network in it; vpg for a run of baseline, whatever its method.
+      format_: run, or safetensors.
+    """
+    from dipn_jax.storage import checkpoint, weights
+
+    console.require_out(out if format_ == "run" else out.parent)
+    if format_ == "run":
+        checkpoint.export(run, out, network=network)
+    else:
+        weights.write(run, out, network=network)
     console.say(f"{out}: {network}")
 
 
