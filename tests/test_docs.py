@@ -10,12 +10,14 @@ import shlex
 import shutil
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import tyro
 from dipn_jax.eval.report import paper
 
 from benchmarks.__main__ import BENCHMARKS
 from dipn_jax import console, files
+from dipn_jax.sight import render
 from experiments import moving_picture, runs, tutorial_pictures
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -35,7 +37,7 @@ ALWAYS = {
     "dipn-eval": [],
 }
 """Options that a test adds to those commands where they make or learn something."""
-MAINTENANCE = ("info", "verify", "repair", "export")
+MAINTENANCE = ("info", "verify", "repair", "export", "replay")
 """Commands that make and learn nothing, and take none of those options."""
 RUN = {
     "many_workers.md": ("push", *MAINTENANCE),
@@ -165,6 +167,8 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
         assert names["kernel"].shape == (3, 3, 64, 24) and names["about"]["network"] == "grasp"
     elif page.name == "many_workers.md":
         assert names["episodes"].poses.shape[:2] == (24, 11)
+        wanted = render.render(names["pushes"].scene[3], names["pushes"].poses[3, 0])
+        np.testing.assert_array_equal(names["seen"][3].height, wanted.height)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import console, files
+from dipn_jax import console, files, forking
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
 
@@ -280,6 +280,7 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     Raises:
       UserError: no run there, no whole step in it, or it holds another network.
     """
+    forking.check()
     run = find(pathlib.Path(run), network=network)
     if not run.is_dir():
         raise UserError(f"checkpoint {run}: no such folder; {WANTED}")
