@@ -44,7 +44,8 @@ class Set:
         Raises:
           UserError: one is no number, or there is no such episode.
         """
-        total, found = len(self.episodes.fault), []
+        total = len(self.episodes.fault)
+        found: list[int] = []
         for word in given:
             first, colon, end = word.partition(":")
             if not (first.isdecimal() and (end.isdecimal() or not colon)):
