@@ -50,7 +50,7 @@ def _scoring(setting: Setting, preset: str, count: int) -> Iterator[tuple[str, f
     _need_torch()
     with tempfile.TemporaryDirectory() as name:
         file = pathlib.Path(name) / "image.npz"
-        np.savez(file, image=_image(setting.seed))
+        np.savez(file, allow_pickle=False, image=_image(setting.seed))
         ours = Worker("grasp_worker", "jax", preset, "score", file)
         other = Worker("grasp_worker", "torch", "paper", "score", file)
         sides = [functools.partial(ours.steps, count), functools.partial(other.steps, 1)]
@@ -75,7 +75,7 @@ def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
         with tempfile.TemporaryDirectory() as name:
             file = pathlib.Path(name) / "examples.npz"
             success = (np.arange(batch) % 2).astype(np.float32)
-            np.savez(file, images=images, pixel=np.full((batch, 2), side // 2), success=success)
+            np.savez(file, allow_pickle=False, images=images, pixel=np.full((batch, 2), side // 2), success=success)
             count = 1 if preset == "paper" else setting.pick(5, 20)
             figure, arguments = f"bench_grasp.vs_torch/{preset}", (preset, "train", file)
             yield from versus(figure, "grasp_worker", arguments, batch=batch, count=count, repeats=setting.pick(3, 9))

@@ -77,7 +77,7 @@ def torch_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[S
 def main() -> None:
     """Run a worker."""
     framework, preset, work, file = sys.argv[1:]
-    with np.load(file) as stored:
+    with np.load(file, allow_pickle=False) as stored:
         arrays = dict(stored)
     worker.serve(*{"jax": jax_step, "torch": torch_step}[framework](preset, work, arrays))
 

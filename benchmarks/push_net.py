@@ -66,7 +66,7 @@ def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
             examples = task.prepare(structs.take(task.train_set, np.arange(batch)))
             arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
             file = pathlib.Path(name) / "examples.npz"
-            np.savez(file, target=np.asarray(examples.target), **arrays)  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, target=np.asarray(examples.target), **arrays)
             count = 1 if preset == "paper" else setting.pick(10, 40)
             figure, arguments = f"push_net.vs_torch/{preset}", (preset, batch, file)
             yield from versus(figure, "push_worker", arguments, batch=batch, count=count, repeats=setting.pick(3, 9))

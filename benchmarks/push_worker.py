@@ -71,7 +71,7 @@ def _target(preset: str, target: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Run a worker."""
     framework, preset, batch, file = sys.argv[1:]
-    with np.load(file) as stored:
+    with np.load(file, allow_pickle=False) as stored:
         arrays = {name: stored[name][: int(batch)] for name in stored}
     worker.serve(*{"jax": jax_step, "torch": torch_step}[framework](preset, arrays))
 

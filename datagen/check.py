@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import batching, console, files, seeds
+from dipn_jax import batching, console, files, seeds, typed
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
@@ -68,7 +68,7 @@ def run(out: pathlib.Path, config: CheckConfig, *, threads: int | None = None) -
                 files.write_json(path, {k: v if np.isfinite(v) else None for k, v in measure().items()})
             progress.advance(1, name)
     for path in sorted((out / "sections").glob("*.json")):  # also those of engines of earlier runs
-        metrics.update(files.read_json(path))
+        metrics.update(files.read_json(path, wanted={str: typed.Maybe(float)}))
     files.write_json(out / "settings.json", settings)
     files.write_json(out / "metrics.json", metrics)
     files.write_text(out / "world.md", page(metrics))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import pathlib
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -15,6 +15,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
+from . import upkeep
 from .check_command import check_world
 from .replay_command import replay
 
@@ -47,10 +48,12 @@ DEFAULT_WORK = Work()
 """One worker that makes everything, with the engine that is faster here."""
 
 
-def _generate(job: Job, out: pathlib.Path, work: Work, *, scorer: Scorer | None = None) -> None:
+def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *, scorer: Scorer | None = None) -> None:
+    """Generate what `job` says; `given` are the options that the command was called with, to be kept."""
     from .generate import generate
 
-    generate(job, out, part=work.shard, of=work.of, threads=work.threads, scorer=scorer)
+    command = upkeep.words(COMMANDS[job.kind], given, without=("out", "shard", "of", "threads"))
+    generate(job, out, part=work.shard, of=work.of, threads=work.threads, scorer=scorer, command=(job.kind, *command))
 
 
 def push(
@@ -83,6 +86,7 @@ def push(
       ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
+    given = dict(locals())
     from dipn_jax.world import scenes
 
     from .generate import Job
@@ -98,7 +102,7 @@ def push(
         engine=work.engine,
         timestep=work.timestep,
     )
-    _generate(job, out, work)
+    _generate(job, out, work, given)
 
 
 def grasp(
@@ -137,6 +141,7 @@ def grasp(
     """
     if grasp_net is None and (guided is not None or hard is not None):
         raise UserError("--guided and --hard are shares of grasps that a network chooses: give --grasp-net, too")
+    given = dict(locals())
     from dipn_jax.world import scenes
 
     from .generate import Job
@@ -152,14 +157,14 @@ def grasp(
         timestep=work.timestep,
     )
     if grasp_net is None:
-        _generate(job, out, work)
+        _generate(job, out, work, given)
     else:
         guided, hard = (value if given is None else given for given, value in ((guided, 0.5), (hard, 0.25)))
-        _generate_guided(job, out, work, grasp_net, guided=guided, hard=hard)
+        _generate_guided(job, out, work, given, guided=guided, hard=hard)
 
 
 def _generate_guided(
-    job: Job, out: pathlib.Path, work: Work, grasp_net: pathlib.Path, *, guided: float, hard: float
+    job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *, guided: float, hard: float
 ) -> None:
     """Generate grasps, the shares `guided` and `hard` of which a network chooses."""
     from dipn_jax.planning import scorers
@@ -167,9 +172,9 @@ def _generate_guided(
 
     if not (guided >= 0 and hard >= 0 and 0 < guided + hard <= 1):
         raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
-    network: Any = checkpoint.load_network(grasp_net, network="grasp")
+    network: Any = checkpoint.load_network(given["grasp_net"], network="grasp")
     job = dataclasses.replace(job, guided=guided, hard=hard, weights=checkpoint.digest(network))
-    _generate(job, out, work, scorer=scorers.aided_scorer(network))
+    _generate(job, out, work, given, scorer=scorers.aided_scorer(network))
 
 
 def images(
@@ -194,6 +199,7 @@ def images(
       ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
+    given = dict(locals())
     from dipn_jax.world import scenes
 
     from .generate import Job
@@ -208,58 +214,18 @@ def images(
         engine=work.engine,
         timestep=work.timestep,
     )
-    _generate(job, out, work)
+    _generate(job, out, work, given)
 
 
-def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
-    """Check every shard against the manifest's sizes and SHA-256; exit 2 if one is wrong.
-
-    Args:
-      folder: a data set.
-    """
-    from dipn_jax.storage import records
-
-    problems = records.verify(folder)
-    if problems:
-        path, what = problems[0]
-        raise UserError(f"{path}: {what} ({len(problems)} wrong in all); run dipn-datagen repair {folder}")
-    console.say(f"{folder}: all shards are whole")
-
-
-def repair(folder: tyro.conf.Positional[pathlib.Path]) -> None:
-    """Set damaged shards aside and rebuild the manifest; the command that made the data set then fills the gaps.
-
-    Args:
-      folder: a data set.
-    """
-    from dipn_jax.storage import records
-
-    removed = records.repair(folder)
-    console.say(
-        f"{folder}: {len(removed)} damaged shards set aside {[p.name for p in removed]}; generate again to fill"
-    )
-
-
-def info(folder: tyro.conf.Positional[pathlib.Path]) -> None:
-    """Print what a data set holds, as JSON: episodes, bytes, config, versions, faults counted.
-
-    Args:
-      folder: a data set.
-    """
-    from dipn_jax.storage import records
-
-    console.say(json.dumps(records.summary(folder), indent=1))
-
-
-COMMANDS = {
+COMMANDS: dict[str, Callable[..., Any]] = {
     "push": push,
     "grasp": grasp,
     "images": images,
     "replay": replay,
     "check-world": check_world,
-    "verify": verify,
-    "repair": repair,
-    "info": info,
+    "verify": upkeep.verify,
+    "repair": upkeep.repair,
+    "info": upkeep.info,
 }
 """The commands of `dipn-datagen`, by name."""
 

@@ -11,19 +11,19 @@ import functools
 import json
 import pathlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 
-from dipn_jax import console, files, seeds, structs
+from dipn_jax import console, files, seeds, structs, typed
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine, resolve
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
-from dipn_jax.storage import records, shards
+from dipn_jax.storage import accounting, records, shards
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 
@@ -147,6 +147,7 @@ def generate(
     of: int = 1,
     threads: int | None = None,
     scorer: Scorer | None = None,
+    command: Sequence[str] | None = None,
 ) -> None:
     """Write the shards of `job` that are missing; worker `part` of `of` workers takes every `of`-th.
 
@@ -159,6 +160,7 @@ def generate(
       of: number of workers.
       threads: that `native` simulates on; shards are then made one at a time, so that no more are used.
       scorer: the network of `job.weights`, for guided and hard grasps.
+      command: what makes the data set, as `accounting.note` keeps it.
 
     Raises:
       UserError: the folder holds a data set of another config.
@@ -170,6 +172,8 @@ def generate(
     job = dataclasses.replace(job, engine=resolve(job.engine))
     engine = make_engine(job.engine, timestep=job.timestep, threads=threads)
     _claim(job, out)
+    if command is not None:
+        accounting.note(out, command, of=of)
     mine = range(part, job.shards(), of)
     todo = [index for index in mine if not _written(out, index, job)]
     total = sum(map(job.size, mine))
@@ -222,7 +226,4 @@ def _claim(job: Job, out: pathlib.Path) -> None:
 def _begun_with(out: pathlib.Path) -> int:
     """Return the number of episodes that the folder was begun with; 0 if it was not."""
     path = out / "config.json"
-    episodes = files.read_json(path).get("episodes", 0) if path.exists() else 0
-    if not isinstance(episodes, int):
-        raise UserError(f"{path}: episodes {episodes}, want a whole number; give another --out")
-    return episodes
+    return int(files.read_json(path, wanted={"episodes": typed.Whole()})["episodes"]) if path.exists() else 0

@@ -14,6 +14,7 @@ import shutil
 import time
 from typing import Any
 
+from dipn_jax import typed
 from dipn_jax.errors import UserError
 
 
@@ -131,21 +132,41 @@ def write_json(path: pathlib.Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def read_json(path: pathlib.Path, *, wanted: type = dict) -> Any:
+def read_json(path: pathlib.Path, *, wanted: typed.Form = dict) -> Any:
     """Return what a JSON file holds.
 
     Raises:
-      UserError: it is missing, is not JSON, or is not a `wanted` at its top.
+      UserError: it is missing, is not JSON, or does not have the form `wanted`.
     """
     try:
-        value = json.loads(read_text(path))
+        return typed.check(typed.parse(path.read_bytes()), wanted)
     except FileNotFoundError:
         raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
-    except (OSError, ValueError):
-        raise UserError(f"{path}: damaged, not JSON; delete it or give another folder") from None
-    if not isinstance(value, wanted):
-        raise UserError(f"{path}: holds a {type(value).__name__}, want a {wanted.__name__}; give another folder")
-    return value
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); mend that, or give another folder") from None
+    except typed.Misfit as error:
+        raise UserError(f"{path}: damaged, {error}; delete it or give another folder") from None
+
+
+def read_lines(path: pathlib.Path, *, wanted: typed.Form = dict) -> list[Any]:
+    """Return what the lines of a log hold, each of them JSON.
+
+    Raises:
+      UserError: it is missing, or a line of it is not JSON or does not have the form `wanted`.
+    """
+    found: list[Any] = []
+    try:
+        for line in read_text(path).splitlines():
+            found.append(typed.check(typed.parse(line), wanted))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); give the --out of a dipn-train command") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: damaged, not UTF-8; train again, or give another --out") from None
+    except typed.Misfit as error:
+        raise UserError(
+            f"{path}: damaged, line {len(found) + 1}: {error}; train again, or give another --out"
+        ) from None
+    return found
 
 
 def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = ()) -> None:
@@ -165,8 +186,9 @@ def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] 
         different = [key for key in mine if key not in free and theirs.get(key) != mine[key]]
         if different:
             key = different[0]
+            begun = typed.one_line(str(theirs.get(key)), most=200)
             raise UserError(
-                f"{out}: begun with {key}={theirs.get(key)}, asked for {key}={mine[key]}; give another --out, or the "
+                f"{out}: begun with {key}={begun}, asked for {key}={mine[key]}; give another --out, or the "
                 "same options and data to continue"
             )
     write_json(path, mine)

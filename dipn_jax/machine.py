@@ -17,6 +17,18 @@ def processor() -> str:
     return next(names, platform.processor() or platform.machine())
 
 
+def instructions(*, info: pathlib.Path = pathlib.Path("/proc/cpuinfo")) -> str:
+    """Return the instruction set that compilers use here: `x86-64-v4` (AVX-512), `x86-64-v3` (AVX2), or less.
+
+    Args:
+      info: what the system says about its processors.
+    """
+    rows = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
+    flags = next((set(row.partition(":")[2].split()) for row in rows if row.startswith("flags")), set())
+    levels = {"x86-64-v4": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}, "x86-64-v3": {"avx2", "fma"}}
+    return next((level for level, needed in levels.items() if needed <= flags), platform.machine().replace("_", "-"))
+
+
 def cores(
     *, groups: pathlib.Path = pathlib.Path("/sys/fs/cgroup"), own: pathlib.Path = pathlib.Path("/proc/self")
 ) -> int:

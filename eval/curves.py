@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from dipn_jax import files
+from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DIPN
 from dipn_jax.storage import checkpoint
@@ -52,12 +51,14 @@ def load_push_runs(runs: Sequence[pathlib.Path]) -> dict[str, DIPN]:
         network = checkpoint.load_network(run, network="dipn")
         meta = checkpoint.newest(run)[1]  # type: ignore[index]
         plan = run / "config.json"
-        planned = files.read_json(plan).get("steps", 0) if plan.exists() else 0
+        planned = files.read_json(plan, wanted={"steps?": int}).get("steps", 0) if plan.exists() else 0
         if planned > meta["step"]:
             raise UserError(f"--curve {run}: stopped at step {meta['step']} of {planned}; run its command to the end")
-        if "examples" not in meta:
-            raise UserError(f"--curve {run}: its checkpoint does not name its number of pushes; train again")
-        key = (int(meta["examples"]), int(meta["seed"]))
+        try:
+            typed.check(meta, {"examples": typed.Whole(), "seed": int})
+        except typed.Misfit:
+            raise UserError(f"--curve {run}: its checkpoint does not name its number of pushes; train again") from None
+        key = (meta["examples"], meta["seed"])
         if key in found:
             raise UserError(f"--curve {run}: a second run of {key[0]} pushes with seed {key[1]}; give one of each")
         found[key] = network  # type: ignore[assignment]
@@ -78,10 +79,7 @@ def load_grasp_runs(runs: Sequence[pathlib.Path]) -> dict[str, dict[int, list[fl
         config = files.read_json(run / "config.json")
         if "pretrained" not in config:
             raise UserError(f"--curve {run}: no run of dipn-train grasp-online")
-        try:
-            lines = [json.loads(line) for line in files.read_text(run / "metrics.jsonl").splitlines()]
-        except (OSError, ValueError):
-            raise UserError(f"--curve {run}: no readable metrics.jsonl; train again") from None
+        lines = files.read_lines(run / "metrics.jsonl", wanted={"step": typed.Whole(), "success": float})
         group = found.setdefault("with" if config["pretrained"] else "without", {})
         for line in lines:
             group.setdefault(int(line["step"]), []).append(float(line["success"]))

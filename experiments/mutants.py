@@ -29,6 +29,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "dipn_jax/sight/imagine.py": ("tests/dipn_jax/sight/test_imagine.py",),
     "dipn_jax/planning/planner.py": ("tests/dipn_jax/planning/test_planner.py",),
     "dipn_jax/planning/candidates.py": ("tests/dipn_jax/planning/test_candidates.py",),
+    "dipn_jax/planning/memory.py": ("tests/dipn_jax/planning/test_memory.py",),
     "dipn_jax/planning/outlook.py": ("tests/dipn_jax/planning/test_outlook.py",),
     "dipn_jax/storage/records.py": ("tests/dipn_jax/storage/test_records.py",),
     "dipn_jax/world/scenes.py": ("tests/dipn_jax/world/test_scenes.py",),

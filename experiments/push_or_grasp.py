@@ -21,17 +21,18 @@ import numpy as np
 from dipn_jax.eval.clearing import film, lockstep, on_tables
 from dipn_jax.eval.clearing.camera import DEFAULT_CAMERA
 from dipn_jax.eval.clearing.instances import Instance
-from dipn_jax.eval.clearing.on_tables import TablePolicy
+from dipn_jax.eval.clearing.on_tables import Recall, TablePolicy
 from dipn_jax.eval.clearing.tables import Tables
 
 from dipn_jax import console, files
 from dipn_jax.engine import Engine
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import outlook, scorers
+from dipn_jax.planning.memory import MissedGrasps
 from dipn_jax.planning.methods import Networks, PolicyConfig
 from dipn_jax.sight import render
 from dipn_jax.storage.resume import Partial
-from dipn_jax.structs import Array, Decision, Scene
+from dipn_jax.structs import Array, Decision, Observation, Scene
 from dipn_jax.world.ranges import Ranges
 from experiments import pages
 
@@ -57,10 +58,10 @@ class PushFirst:
     then: TablePolicy
     begun: bool = False
 
-    def __call__(self, keys: jax.Array, scene: Scene, poses: Array, missed: Array) -> tuple[Decision, Array]:
+    def __call__(self, keys: jax.Array, scene: Scene, poses: Array, recall: Recall) -> tuple[Decision, Observation]:
         """Decide on tables; see `on_tables.TablePolicy`."""
         policy, self.begun = (self.then if self.begun else self.push), True
-        return policy(keys, scene, poses, missed)
+        return policy(keys, scene, poses, recall)
 
 
 def compare(engine: Engine, tables: Tables, out: pathlib.Path) -> list[dict[str, Any]]:
@@ -86,8 +87,10 @@ def _at(table: Instance, step: int) -> Instance:
     """Return a table as it was before an action."""
     before = table.film[step]
     scene = table.scene.replace(shape=before["shape"])
-    missed = tuple(one for one in before["missed"] if one[0] >= 0)
-    return Instance(table.name, scene, before["poses"].copy(), int((before["shape"] >= 0).sum()), missed=missed)
+    height, memory = render.render(scene, before["poses"]).height, MissedGrasps()
+    for grasp in before["missed"][before["missed"][:, 0] >= 0]:
+        memory = memory.add(grasp, height)
+    return Instance(table.name, scene, before["poses"].copy(), int((before["shape"] >= 0).sum()), missed=memory)
 
 
 def _shortfalls(states: Sequence[tuple[Instance, int]]) -> list[float]:

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from dipn_jax import console, files, machine
+from dipn_jax import console, files, machine, typed
 from dipn_jax.errors import UserError
 
 PROGRAMS = {
@@ -27,6 +27,16 @@ PROGRAMS = {
 
 STAMP = "stamp.json"
 """File in a run's folder: the command that wrote there, whether it is complete, and with what machines and commits."""
+
+_STAMP = {
+    "command": str,
+    "key": str,
+    "complete": bool,
+    "made_by": [{"commit": str, "processor": str, "cores": typed.Maybe(int)}],
+    "seed": typed.Maybe(int),
+    "versions": {str: str},
+}
+"""Form of a stamp."""
 
 NOT_RECORDED = "not recorded"
 """What a stamp says of work done in its folder before there was a stamp."""
@@ -122,7 +132,7 @@ def select(listed: Sequence[Run], only: Sequence[str]) -> list[Run]:
 def read_stamp(run: Run) -> dict[str, Any]:
     """Return the stamp in a run's folder; empty where there is none."""
     path = run.out / STAMP
-    return files.read_json(path) if path.exists() else {}
+    return files.read_json(path, wanted=_STAMP) if path.exists() else {}
 
 
 def is_complete(run: Run, key: str) -> bool:

@@ -27,8 +27,8 @@ MOST_LINES = 300
 """Largest number of lines in a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "names", "seeds", "interruption", "forking", "files", "console", "machine", "structs", "workspace",
-    "geometry", "batching", "engine", "world", "physics", "sight", "networks", "storage", "planning",
+    "errors", "names", "seeds", "typed", "interruption", "forking", "files", "console", "machine", "structs",
+    "workspace", "geometry", "batching", "engine", "world", "physics", "sight", "networks", "storage", "planning",
 ]  # fmt: skip
 
 
@@ -157,6 +157,18 @@ def test_text_files_are_read_and_written_as_utf8() -> None:
                     modes = [str(arg.value) for arg in call.args if isinstance(arg, ast.Constant)]
                     named = any(keyword.arg == "encoding" for keyword in call.keywords)
                     assert named or any("b" in mode for mode in modes), f"{path}: {ast.unparse(call)}"
+
+
+def test_nothing_is_pickled() -> None:
+    """No module unpickles, which would run what is in a file; NumPy is told not to at every call that could."""
+    forbidden = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
+    for package in (*PACKAGES, *TOPS):
+        for path in (ROOT / package).rglob("*.py"):
+            assert not {name.split(".")[0] for name in _imports(path)} & forbidden, path
+            for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+                if re.fullmatch(r"(np|numpy|jnp)\.(load|save|savez|savez_compressed)", ast.unparse(call.func)):
+                    said = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
+                    assert said.get("allow_pickle") == "False", f"{path}: {ast.unparse(call)}"
 
 
 def _pins() -> dict[str, str]:

@@ -127,6 +127,7 @@ def score_image(
     action: Literal["grasp", "push"] = "grasp",
     squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
     table: bool = True,
+    lowest: float = 0.0,
 ) -> Float[jax.Array, "16 224 224"]:
     """Return the scores of all grasps, or all pushes, of one image.
 
@@ -134,9 +135,11 @@ def score_image(
       network: GN, or another of its kind, in evaluation mode.
       image: RGB in [0, 1] and height in metres.
       action: grasps are scored by the `compact` network at half of the rotations, because a grasp turned by half a turn
-        is the same grasp, and score 0 on empty table; pushes are scored at all rotations, and everywhere.
+        is the same grasp, and score `lowest` on empty table; pushes are scored at all rotations, and everywhere.
       squash: function from the network's outputs to scores.
-      table: whether grasps centred on empty table score 0; False: what the network says, which never grasped there.
+      table: whether grasps centred on empty table score `lowest`; False: what the network says, which never grasped
+        there.
+      lowest: 0 for chances, -inf for values, which may be negative everywhere.
 
     Returns:
       Scores in [0, 1]: closing axis at k * 22.5 degrees from +x, centred on the pixel.
@@ -152,7 +155,7 @@ def score_image(
         views = jax.vmap(lambda a: geometry.rotate_map(image - empty, a, VIEW_PIXELS) + empty)(angles)
         scores = squash(network(views))
         scores = jax.vmap(lambda s, a: geometry.unrotate_map(s, a, WORKSPACE.pixels))(scores, angles)
-    return jnp.where(image[..., 3] > fingers.EMPTY_HEIGHT, scores, 0.0) if action == "grasp" and table else scores
+    return jnp.where(image[..., 3] > fingers.EMPTY_HEIGHT, scores, lowest) if action == "grasp" and table else scores
 
 
 def aided_scores(
@@ -161,6 +164,7 @@ def aided_scores(
     *,
     aids: Collection[Aid] = ALL_AIDS,
     squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
+    lowest: float = 0.0,
 ) -> Float[jax.Array, "16 224 224"]:
     """Return the scores of all grasps to choose one by, with some of the aids of `names.Aid`.
 
@@ -172,10 +176,11 @@ def aided_scores(
     Args:
       network: GN, or another of its kind, in evaluation mode.
       image: RGB in [0, 1] and height in metres.
-      aids: those wanted; `still` and `memory` are not about scores of one image.
+      aids: those wanted; `top`, `still` and `memory` are not about the scores of one image.
       squash: function from the network's outputs to scores.
+      lowest: as of `score_image`.
     """
-    score = functools.partial(score_image, network, squash=squash, table="table" in aids)
+    score = functools.partial(score_image, network, squash=squash, table="table" in aids, lowest=lowest)
     scores = score(image)
     if "mirrors" in aids:
         scores = functools.reduce(jnp.minimum, [_mirrored(score, image, axes) for axes in ((0,), (1,), (0, 1))], scores)

@@ -43,19 +43,27 @@ def imagining(
     return act
 
 
-def comparing(push_scorer: Scorer, scorer: Scorer, *, grasp_at_once: bool) -> Act:
+def comparing(push_scorer: Scorer, scorer: Scorer, plain: Scorer, *, grasp_at_once: bool) -> Act:
     """Return the function that compares the best push and the best grasp by value; pushes go the first distance.
 
     Args:
       push_scorer: values of pushes.
-      scorer: values of grasps.
+      scorer: values of grasps, to choose one by.
+      plain: values of grasps as the network gives them, to compare the chosen one with pushes.
       grasp_at_once: whether to grasp at once above the rule's `grasp_above`.
     """
 
     def act(_: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
         above = rule.grasp_above if grasp_at_once else jnp.inf
         return planner.decide_by_value(
-            seen, push_scorer, scorer, distance=distances[0], grasp_above=above, missed=missed
+            seen,
+            push_scorer,
+            scorer,
+            plain=plain,
+            distance=distances[0],
+            grasp_above=above,
+            top_margin=rule.top_margin,
+            missed=missed,
         )
 
     return act

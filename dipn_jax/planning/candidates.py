@@ -33,6 +33,9 @@ SAME_GRASP_PIXELS = 10.0
 SAME_GRASP_ROTATIONS = 1
 """Largest difference in rotations (of 16) between two grasps that count as the same grasp."""
 
+LEVEL_HEIGHT = 0.01
+"""Metres: the step of heights by which `grasp_from_top` tells higher from lower."""
+
 _OVERSAMPLE = 4  # pixels of contours drawn for each push
 
 
@@ -181,6 +184,23 @@ def best_grasp(scores: Float[Array, "R H W"]) -> tuple[Int[jax.Array, " 3"], Flo
     return index, scores.reshape(-1)[flat]
 
 
+def grasp_from_top(
+    scores: Float[Array, "R H W"], height: Float[Array, "H W"], margin: Float[Array, ""] | float
+) -> tuple[Int[jax.Array, " 3"], Float[jax.Array, ""]]:
+    """Return the index `[3]` of the best grasp of the highest thing on which one scores nearly best, and its score.
+
+    What lies under something else is then not pulled from under it.
+
+    Args:
+      scores: `[16, H, W]`.
+      height: metres; what is within the same LEVEL_HEIGHT is as high.
+      margin: by how much a score may be lower than the best; 0 is `best_grasp`.
+    """
+    near = scores >= scores.max() - margin
+    level = jnp.where(near, jnp.floor(jnp.asarray(height) / LEVEL_HEIGHT), -jnp.inf)
+    return best_grasp(jnp.where(near & (level == level.max()), scores, -jnp.inf))
+
+
 def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) -> Float[jax.Array, "R H W"]:
     """Halve scores `[16, H, W]` near grasps that missed, once for each of them.
 
@@ -198,13 +218,17 @@ def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) ->
     return jnp.minimum(scores, scores * 0.5**count)
 
 
+def without(scores: Float[Array, "R H W"], grasp: Int[Array, " 3"], *, apart: float = 8.0) -> Float[jax.Array, "R H W"]:
+    """Return the scores with -1 for all grasps that are less than `apart` pixels from a grasp `[3]`."""
+    away = geometry.view_grid(*scores.shape[1:]) - jnp.asarray(grasp)[::-1][:2]
+    return jnp.where(jnp.linalg.norm(away, axis=-1) < apart, -1.0, scores)
+
+
 def best_grasps(scores: Float[Array, "R H W"], *, count: int, apart: float = 8.0) -> Int[jax.Array, "{count} 3"]:
     """Return the `count` best grasps by score, at least `apart` pixels from one another."""
-    grid = geometry.view_grid(*scores.shape[1:])
 
     def next_best(left: Array, _: None) -> tuple[Array, jax.Array]:
         index = best_grasp(left)[0]
-        near = jnp.linalg.norm(grid - index[::-1][:2], axis=-1) < apart
-        return jnp.where(near, -1.0, left), index
+        return without(left, index, apart=apart), index
 
     return jax.lax.scan(next_best, scores, None, length=count)[1]

@@ -18,7 +18,7 @@ from dipn_jax.names import ALL_AIDS, Aid, MethodName
 from dipn_jax.networks import vpg
 from dipn_jax.planning import acts, outlook, planner, predictors, scorers
 from dipn_jax.planning.acts import Act
-from dipn_jax.planning.planner import Rule, Scorer, ScoreSummary
+from dipn_jax.planning.planner import Predictor, Rule, Scorer, ScoreSummary
 from dipn_jax.sight import observed
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Decision, Observation
@@ -81,8 +81,8 @@ class PolicyConfig:
     def rule(self) -> Rule:
         """Return the rule that the planner compares by."""
         rule = planner.RELEASED if self.released else Rule()
-        small = "still" not in self.aids
-        result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above, draw_all=small)
+        small, margin = "still" not in self.aids, planner.TOP_MARGIN if "top" in self.aids else 0.0
+        result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above, draw_all=small, top_margin=margin)
         return result
 
     def spread(self) -> Float[np.ndarray, " P"]:
@@ -171,10 +171,10 @@ def load_policy(
     return build(Networks(*paths).runs(method), config)
 
 
-def grasping_policy(scorer: Scorer) -> Policy:
+def grasping_policy(scorer: Scorer, config: PolicyConfig = PolicyConfig()) -> Policy:
     """Return the policy that grasps where `scorer` is highest, and never pushes."""
     act = acts.imagining(predictors.static_predictor, scorer, None)
-    return Policy(act, Rule(grasp_above=-1.0), np.array([0.1], np.float32))
+    return Policy(act, config.rule().replace(grasp_above=-1.0), np.array([0.1], np.float32))
 
 
 def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSummary]:
@@ -186,39 +186,45 @@ def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSum
     return scorers.load_scorer(run, aids=config.aids), summary
 
 
+def _predictor(runs: Runs, config: PolicyConfig) -> Predictor:
+    return predictors.load_predictor(runs["push"], mirrors="mirrors" in config.aids)
+
+
 def _dipn_gn(runs: Runs, config: PolicyConfig) -> Policy:
-    act = acts.imagining(predictors.load_predictor(runs["push"]), *gn_scores(runs["grasp"], config))
+    act = acts.imagining(_predictor(runs, config), *gn_scores(runs["grasp"], config))
     return Policy(act, config.rule(), config.spread())
 
 
 def _dipn_gn_actions(runs: Runs, config: PolicyConfig) -> Policy:
     scorer, summarize = gn_scores(runs["grasp"], config)
     estimate = outlook.misses_to_come(scorer)
-    act = acts.imagining(predictors.load_predictor(runs["push"]), scorer, summarize, estimate=estimate)
+    act = acts.imagining(_predictor(runs, config), scorer, summarize, estimate=estimate)
     return Policy(act, config.rule(), config.spread())
 
 
 def _rea_dipn(runs: Runs, config: PolicyConfig) -> Policy:
     table = "table" in config.aids
     summary = scorers.load_summary(runs["value"], network="vpg", whole=config.released, table=table)
-    act = acts.imagining(predictors.load_predictor(runs["push"]), _chances(runs["value"], config.aids), summary)
+    act = acts.imagining(_predictor(runs, config), _chances(runs["value"], config.aids), summary)
     return Policy(act, config.rule(), config.spread())
 
 
 def _dqn_gn(runs: Runs, config: PolicyConfig) -> Policy:
     scorer = scorers.load_scorer(runs["grasp"], aids=config.aids)
-    act = acts.comparing(_part(runs["value"], "push"), scorer, grasp_at_once=True)
+    plain = scorers.load_plain_scorer(runs["grasp"], table="table" in config.aids)
+    act = acts.comparing(_part(runs["value"], "push"), scorer, plain, grasp_at_once=True)
     return Policy(act, config.rule(), config.spread())
 
 
 def _vpg(runs: Runs, config: PolicyConfig) -> Policy:
     pushes, grasps = _part(runs["value"], "push"), _part(runs["value"], "grasp", config.aids)
-    act = acts.comparing(pushes, grasps, grasp_at_once=False)
+    table: tuple[Aid, ...] = ("table",) if "table" in config.aids else ()
+    act = acts.comparing(pushes, grasps, _part(runs["value"], "grasp", table), grasp_at_once=False)
     return Policy(act, config.rule(), config.spread())
 
 
 def _gn(runs: Runs, config: PolicyConfig) -> Policy:
-    return grasping_policy(scorers.load_scorer(runs["grasp"], aids=config.aids))
+    return grasping_policy(scorers.load_scorer(runs["grasp"], aids=config.aids), config)
 
 
 def _chances(run: pathlib.Path, aids: tuple[Aid, ...]) -> Scorer:

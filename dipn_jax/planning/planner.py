@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Key
 
-from dipn_jax.planning import candidates
+from dipn_jax.planning import candidates, memory
 from dipn_jax.sight import fingers, imagine, masks, render
 from dipn_jax.structs import Array, Candidates, Decision, Observation, Push, Pytree
 
@@ -32,6 +32,8 @@ Estimate = Callable[[Observation, jax.Array], jax.Array]
 
 NONE_MISSED = np.full((1, 3), -1, np.int32)
 """The value of `missed` when no grasp has missed."""
+TOP_MARGIN = 0.05
+"""Value of `Rule.top_margin` with the aid `top`."""
 UNDRAWN_SHIFT = 0.001
 """Metres: a predicted motion smaller than this, with a turn below UNDRAWN_TURN, is not drawn (half a pixel)."""
 UNDRAWN_TURN = np.deg2rad(1.0)
@@ -54,6 +56,7 @@ class Rule(Pytree):
         1.0  # a predicted motion is multiplied by it to judge whether an object leaves the workspace
     )
     draw_all: Bool[Array, ""] | bool = False  # draw also motions below UNDRAWN_SHIFT and UNDRAWN_TURN
+    top_margin: Float[Array, ""] | float = 0.0  # see `candidates.grasp_from_top`
     # clauses that only DIPN's released code has
     grasp_lone: Bool[Array, ""] | bool = False  # a lone object is grasped
     push_must_raise_best: Bool[Array, ""] | bool = False  # a push must raise the best score, too
@@ -97,7 +100,8 @@ def find_candidates(
 ) -> Candidates:
     """Score all grasps and sample `count` pushes; arguments as of `decide`."""
     now = scorer(render.rgbd(observation)[None])[0]
-    index, best = candidates.best_grasp(candidates.discount_missed(now, missed))
+    known = candidates.discount_missed(now, missed)
+    index, best = candidates.grasp_from_top(known, observation.height, rule.top_margin)
     pushes, feasible = candidates.sample_pushes(key, observation, count=count, distance=distance)
     _, area = masks.mask_centers(observation.label, observation.slots)
     lone = jnp.asarray(rule.grasp_lone) & ((area > 0).sum() < 2)
@@ -169,7 +173,8 @@ def _count_actions(
     now = estimate(observation, missed)
 
     def after() -> jax.Array:
-        return 1.0 + estimate(imagine.imagine(observation, centers, _drawn(decision.motion, rule)), missed)
+        there = imagine.imagine(observation, centers, _drawn(decision.motion, rule))
+        return 1.0 + estimate(there, memory.forget_changed(missed, observation.height, there.height))
 
     cost = jax.lax.cond(jnp.isfinite(decision.value_push), after, lambda: jnp.float32(jnp.inf))
     return decision.replace(is_push=cost < now, value_now=-now, value_push=-cost)
@@ -224,14 +229,16 @@ def decide(
     return _count_actions(decision, observation, jnp.asarray(missed), estimate, rule)
 
 
-@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer"))
+@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer", "plain"))
 def decide_by_value(
     observation: Observation,
     push_scorer: Scorer,
     scorer: Scorer,
     *,
+    plain: Scorer | None = None,
     distance: Float[Array, ""] | float,
     grasp_above: Float[Array, ""] | float = jnp.inf,
+    top_margin: Float[Array, ""] | float = 0.0,
     missed: Int[Array, "M 3"] = NONE_MISSED,
 ) -> Decision:
     """Choose the best of all grasps and pushes by their values, without imagining images, as VPG does.
@@ -239,33 +246,38 @@ def decide_by_value(
     Args:
       observation: what the camera sees now.
       push_scorer: values of pushes that start at each pixel in each of 16 directions.
-      scorer: values of grasps.
+      scorer: values of grasps, the best of which is chosen.
+      plain: values of grasps that are compared with those of pushes, where `scorer` lowers them; `scorer` by default.
       distance: push distance, metres.
-      grasp_above: grasp at once if the best grasp's value is higher.
+      grasp_above: grasp at once if the best grasp's value by `scorer` is higher.
+      top_margin: as of `Rule`.
       missed: `[M, 3]` as of `decide`.
 
     Returns:
       The decision; its only candidate is the best push that the closed gripper can begin.
     """
     image = render.rgbd(observation)
-    pixel, grasp_value = candidates.best_grasp(candidates.discount_missed(scorer(image[None])[0], missed))
+    known = candidates.discount_missed(scorer(image[None])[0], missed)
+    pixel, score = candidates.grasp_from_top(known, observation.height, top_margin)
+    values = (plain or scorer)(image[None])[0]
+    grasp_value = candidates.discount_missed(values, missed)[tuple(pixel)]
     possible = fingers.pushable(observation.height)
     values = jnp.where(possible, push_scorer(image[None])[0], -jnp.inf)
     where, push_value = candidates.best_grasp(values)
     push = candidates.push_at(where, distance)
-    grasp_now = grasp_value > grasp_above
+    grasp_now = score > grasp_above
     only = jax.tree.map(lambda leaf: leaf[None], push)
     return Decision(
         is_push=(push_value > grasp_value) & ~grasp_now,
         push=push,
         grasp=candidates.grasp_at(pixel, observation.height),
         grasp_pixel=pixel,
-        grasp_score=grasp_value,
+        grasp_score=score,
         value_now=grasp_value,
         value_push=push_value,
         motion=jnp.zeros((observation.slots, 3)),
         best=jnp.zeros((), jnp.int32),
         values=push_value[None],
-        candidates=Candidates(only, possible.any()[None], pixel, grasp_value, grasp_value, grasp_now),
+        candidates=Candidates(only, possible.any()[None], pixel, score, grasp_value, grasp_now),
         predicted=image,
     )

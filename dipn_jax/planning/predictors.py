@@ -34,7 +34,12 @@ def trans_predictor(observation: Observation, pushes: Push) -> Float[jax.Array, 
 
 
 def dipn_motions(
-    model: dipn.DIPN, observation: Observation, pushes: Push, distances: Float[Array, "P K"]
+    model: dipn.DIPN,
+    observation: Observation,
+    pushes: Push,
+    distances: Float[Array, "P K"],
+    *,
+    mirrors: bool = True,
 ) -> Float[jax.Array, "P K N 3"]:
     """Predict motions by pushes `[P]`, each on its own observation `[P, H, W]` or all on the same `[H, W]`.
 
@@ -43,6 +48,7 @@ def dipn_motions(
       observation: its labels are the masks, from the simulator or found in the image.
       pushes: `[P]`; their own distance is not looked at.
       distances: metres.
+      mirrors: average over the push and its mirror image (`dipn.symmetric`).
 
     Returns:
       dx, dy (metres) of each mask's centroid, dtheta (radians), workspace.
@@ -53,25 +59,26 @@ def dipn_motions(
         inputs, _ = jax.vmap(make, in_axes=(None, None, 0))(observation.label, observation.height, pushes)
     else:
         inputs, _ = push_frame.push_inputs(observation.label, observation.height, pushes, slots=slots, view=view)
-    motion = dipn.symmetric(model, inputs, distances)
+    motion = (dipn.symmetric if mirrors else dipn.DIPN.__call__)(model, inputs, distances)
     return push_frame.to_workspace(motion.swapaxes(1, 2), pushes.angle[:, None])
 
 
-def dipn_predictor(model: dipn.DIPN) -> Predictor:
-    """Return DIPN as a predictor of each push's own distance."""
+def dipn_predictor(model: dipn.DIPN, *, mirrors: bool = True) -> Predictor:
+    """Return DIPN as a predictor of each push's own distance; `mirrors` as of `dipn_motions`."""
     graph, state = nnx.split(model)
 
     def predict(observation: Observation, pushes: Push) -> jax.Array:
         network = nnx.merge(graph, state)
-        return dipn_motions(network, observation, pushes, pushes.distance[:, None])[:, 0]
+        return dipn_motions(network, observation, pushes, pushes.distance[:, None], mirrors=mirrors)[:, 0]
 
     return predict
 
 
-def load_predictor(run: pathlib.Path | str) -> Predictor:
-    """Load the predictor of a `dipn-train push` run, or `builtin`.
+def load_predictor(run: pathlib.Path | str, *, mirrors: bool = True) -> Predictor:
+    """Load the predictor of a `dipn-train push` run, or `builtin`; `mirrors` as of `dipn_motions`.
 
     Raises:
       UserError: as `checkpoint.load_network`.
     """
-    return dipn_predictor(checkpoint.load_network(pathlib.Path(run), network="dipn"))  # type: ignore[arg-type]
+    model = checkpoint.load_network(pathlib.Path(run), network="dipn")
+    return dipn_predictor(model, mirrors=mirrors)  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 from flax import nnx
 
 from dipn_jax.names import ALL_AIDS, Aid
@@ -71,14 +72,24 @@ def value_scorers(model: vpg.VPG, *, aids: Collection[Aid] = TABLE_AID) -> tuple
       model: the network.
       aids: that grasps are chosen with; pushes have none.
     """
-    squash = nnx.sigmoid if model.config.answers == "chance" else (lambda x: x)
+    chance = model.config.answers == "chance"
+    squash, lowest = (nnx.sigmoid, 0.0) if chance else ((lambda x: x), -jnp.inf)
     push, grasps = (getattr(model, name) if name in model.config.parts else None for name in vpg.PARTS)
     score_push = functools.partial(grasp.score_image, action="push", squash=squash)
-    score_grasp = functools.partial(grasp.aided_scores, aids=tuple(aids), squash=squash)
+    score_grasp = functools.partial(grasp.aided_scores, aids=tuple(aids), squash=squash, lowest=lowest)
     return (
         None if push is None else _scorer(push, score_push),
         None if grasps is None else _scorer(grasps, score_grasp),
     )
+
+
+def load_plain_scorer(run: pathlib.Path | str, *, table: bool = True) -> Scorer:
+    """Load the scorer of a `dipn-train grasp` run, or `builtin`, with its scores as they are; see `plain_scorer`.
+
+    Raises:
+      UserError: as `checkpoint.load_network`.
+    """
+    return plain_scorer(checkpoint.load_network(pathlib.Path(run), network="grasp"), table=table)  # type: ignore[arg-type]
 
 
 def load_scorer(run: pathlib.Path | str, *, aids: Collection[Aid] = ALL_AIDS) -> Scorer:

@@ -11,7 +11,6 @@ import dataclasses
 import errno
 import functools
 import hashlib
-import json
 import logging
 import os
 import pathlib
@@ -24,9 +23,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import console, files, forking
+from dipn_jax import console, files, forking, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
+from dipn_jax.storage import stored_step
 
 WANTED = "give a run (the --out of dipn-train), one step of it (RUN@STEP) or that step's folder (RUN/checkpoints/STEP)"
 """What is accepted where a network is asked for, for messages."""
@@ -150,12 +150,12 @@ def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
 def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
     """Return the metadata of a step folder, or None if anything in it is missing or changed."""
     try:
-        meta = json.loads(files.read_text(folder / "meta.json"))
-        good = all(files.file_sha256(folder / name) == digest for name, digest in meta["sha256"].items())
-        good = good and meta["format_version"] == FORMAT_VERSION and meta["network"] in NETWORKS
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        meta: dict[str, Any] = typed.check(typed.parse((folder / "meta.json").read_bytes()), stored_step.FORM)
+        stored = {typed.inside(folder, name): digest for name, digest in meta["sha256"].items()}
+        good = all(files.file_sha256(path) == digest for path, digest in stored.items())
+    except (OSError, typed.Misfit):
         return None
-    return meta if good else None
+    return meta if good and meta["format_version"] == FORMAT_VERSION and meta["network"] in NETWORKS else None
 
 
 def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
@@ -192,7 +192,7 @@ def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
     Raises:
       UserError: the stored arrays have other names or shapes.
     """
-    stored = _numpy_arrays((folder / name).resolve())
+    stored = stored_step.arrays((folder / name).resolve())
     wanted = _flat(target)
     different = sorted(set(stored) ^ set(wanted)) + [
         key for key in wanted if key in stored and stored[key].shape != _stored_shape(wanted[key])
@@ -222,15 +222,6 @@ def _on_device(stored: np.ndarray, *, like: Any) -> jax.Array:
     return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if _is_key(like) else array
 
 
-def _numpy_arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
-    """Return the arrays of one Orbax folder by their path in the tree, whatever devices saved them."""
-    checkpointer = ocp.PyTreeCheckpointer()
-    stored = checkpointer.metadata(part).item_metadata.tree
-    as_numpy = {key: ocp.RestoreArgs(restore_type=np.ndarray) for key in stored}
-    restored: dict[str, np.ndarray] = checkpointer.restore(part, restore_args=as_numpy)
-    return restored
-
-
 def digest(model: nnx.Module) -> str:
     """Return the SHA-256 of a network's parameters."""
     found = hashlib.sha256()
@@ -240,9 +231,8 @@ def digest(model: nnx.Module) -> str:
 
 
 def config_from_json(name: str, values: dict[str, Any]) -> Any:
-    """Return a network's config dataclass, from its values in `meta.json`."""
-    fields = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return NETWORKS[name][0](**fields)
+    """Return a network's config dataclass, from its values in `meta.json`; raise TypeError if they do not fit it."""
+    return stored_step.config(NETWORKS[name][0], values)
 
 
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
@@ -294,6 +284,7 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
         config = config_from_json(network, meta["network_config"])
     except TypeError as error:
         raise UserError(f"checkpoint {run}: its config does not fit this version ({error}); train again") from None
+    stored_step.require_room((folder / "model").resolve(), config)
     model = build(network, config)
     nnx.update(model, restore(folder, "model", nnx.state(model)))
     model.eval()

@@ -11,7 +11,7 @@ import pathlib
 import socket
 from collections.abc import Iterator
 
-from dipn_jax import console, files
+from dipn_jax import console, files, typed
 from dipn_jax.errors import UserError
 
 
@@ -75,8 +75,8 @@ def _exclusive(path: pathlib.Path) -> tuple[int, pathlib.Path]:
 def _read(path: pathlib.Path) -> dict[str, object]:
     """Return what stands in the file; nothing if it is damaged or gone."""
     try:
-        found = json.loads(files.read_text(path))
-    except (OSError, ValueError):
+        found = typed.parse(path.read_bytes())
+    except (OSError, typed.Misfit):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import files
+from dipn_jax import console, files, typed
 from dipn_jax.errors import UserError
-from dipn_jax.storage import shards
+from dipn_jax.storage import accounting, layout, shards
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 
 try:
@@ -22,6 +22,19 @@ except ImportError:  # Windows
 
 MANIFEST = "manifest.json"
 """Name of the file that lists the shards of a data set."""
+_FORM = {
+    "kind": typed.Maybe(set(layout.KINDS)),
+    "shards": {
+        str: {
+            "episodes": typed.Whole(1),
+            "bytes": typed.Whole(),
+            "sha256": str,
+            "kind": set(layout.KINDS),
+            "faults": {str: typed.Whole()},
+        }
+    },
+}
+"""Form of the manifest."""
 
 
 def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
@@ -40,12 +53,12 @@ def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """Write the manifest anew, as `update_manifest` says, and return it."""
     known = _read_manifest(folder)["shards"] if (folder / MANIFEST).exists() else {}
     entries: dict[str, Any] = {}
-    for path in sorted(folder.glob("shard-*.parquet")):
+    for path in shards.shard_files(folder):
         entry = known.get(path.name)
         if entry is None or entry["bytes"] != path.stat().st_size:
             meta = shards.read_meta(path)
             entry = {
-                "episodes": shards.count(path),
+                "episodes": meta["episodes"],
                 "bytes": path.stat().st_size,
                 "sha256": files.file_sha256(path),
                 "kind": meta["kind"],
@@ -66,33 +79,45 @@ def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """Return the manifest of a data set; raise UserError if it is missing or damaged."""
     path = folder / MANIFEST
     try:
-        manifest = json.loads(files.read_text(path))
-        for entry in manifest["shards"].values():
-            if not {"bytes", "sha256", "episodes", "faults"} <= set(entry):
-                raise KeyError
+        manifest: dict[str, Any] = typed.check(typed.parse(path.read_bytes()), _FORM)
+        for name in manifest["shards"]:
+            if "/" in name or not (name.startswith("shard-") and name.endswith(".parquet")):
+                raise typed.Misfit(f"{typed.brief(name)} is no name of a shard")
+            typed.inside(folder, name)
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"data set {folder}: no {MANIFEST}; give a folder that dipn-datagen wrote") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise UserError(f"data set {folder}: {MANIFEST} is damaged; run dipn-datagen repair {folder}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); mend that, or give another folder") from None
+    except typed.Misfit as error:
+        raise UserError(
+            f"data set {folder}: {MANIFEST} is damaged; run dipn-datagen repair {folder} ({error})"
+        ) from None
     return manifest
+
+
+def _problem(path: pathlib.Path, entry: dict[str, Any]) -> str:
+    """Return what is wrong with a shard that the manifest lists so; an empty text if nothing is."""
+    if not path.is_file():
+        return "missing"
+    if path.stat().st_size != entry["bytes"]:
+        return f"{path.stat().st_size} bytes, want {entry['bytes']}"
+    if files.file_sha256(path) != entry["sha256"]:
+        return "SHA-256 differs from the manifest's"
+    try:
+        meta = shards.read_meta(path)  # of this schema version
+    except shards.DamagedShard as error:
+        return error.what
+    if (meta["episodes"], meta["kind"]) != (entry["episodes"], entry["kind"]):
+        return f"{meta['episodes']} {meta['kind']} episodes, want {entry['episodes']} {entry['kind']}"
+    return ""
 
 
 def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
     """Return the shards that are missing, damaged or unlisted, each with what is wrong; empty if none is."""
-    manifest, problems = _read_manifest(folder), []
-    for name, entry in manifest["shards"].items():
-        path = folder / name
-        if not path.exists():
-            problems.append((path, "missing"))
-        elif path.stat().st_size != entry["bytes"]:
-            problems.append((path, f"{path.stat().st_size} bytes, want {entry['bytes']}"))
-        elif files.file_sha256(path) != entry["sha256"]:
-            problems.append((path, "SHA-256 differs from the manifest's"))
-        else:
-            shards.read_meta(path)  # of this schema version
-    listed = set(manifest["shards"])
-    problems += [(p, "not in the manifest") for p in sorted(folder.glob("shard-*.parquet")) if p.name not in listed]
-    return problems
+    listed = _read_manifest(folder)["shards"]
+    checked = [(folder / name, _problem(folder / name, entry)) for name, entry in listed.items()]
+    unlisted = [(path, "not in the manifest") for path in shards.shard_files(folder) if path.name not in listed]
+    return [(path, what) for path, what in checked if what] + unlisted
 
 
 def repair(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -108,13 +133,8 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     except UserError:
         known = {}
     removed = []
-    for path in sorted(folder.glob("shard-*.parquet")):
-        try:
-            shards.read_shard(path, kind=shards.read_meta(path)["kind"])
-            good = path.name not in known or files.file_sha256(path) == known[path.name]["sha256"]
-        except shards.DamagedShard:
-            good = False
-        if not good:
+    for path in shards.shard_files(folder):
+        if not _good(path, known.get(path.name)):
             path.rename(path.with_suffix(".parquet.damaged"))
             removed.append(path)
     (folder / MANIFEST).unlink(missing_ok=True)
@@ -122,24 +142,54 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     return removed
 
 
+def _good(path: pathlib.Path, entry: dict[str, Any] | None) -> bool:
+    """Return whether a shard can be read to its end, and is the one that the manifest lists, if it lists one."""
+    try:
+        typed.inside(path.parent, path.name)
+        if not path.is_file() or (entry is not None and files.file_sha256(path) != entry["sha256"]):
+            return False
+        shards.read_shard(path, kind=shards.read_meta(path)["kind"])
+    except (shards.DamagedShard, typed.Misfit):
+        return False
+    return True
+
+
 def summary(folder: pathlib.Path) -> dict[str, Any]:
-    """Describe a data set: counts, bytes, faults, and the config and versions of its first shard."""
+    """Describe a data set: counts, bytes, faults, who made it, and the config and versions of its first shard.
+
+    `asked` is the number of episodes that were asked for, and `missing` says in one line what is not there of them;
+    both are None where nothing is known. `made_by` lists every combination of versions and kind of processor.
+    """
     manifest = _read_manifest(folder)
+    entries = manifest["shards"]
+    metas = [shards.read_meta(folder / name) for name in entries]
     faults: dict[str, int] = {}
-    for entry in manifest["shards"].values():
+    for entry in entries.values():
         for name, count in entry["faults"].items():
             faults[name] = faults.get(name, 0) + count
-    first = next(iter(manifest["shards"]), None)
-    meta = shards.read_meta(folder / first) if first else {}
+    held = accounting.held(entries)
+    asked = accounting.asked(folder)
     return {
         "kind": manifest["kind"],
-        "episodes": manifest["episodes"],
-        "shards": len(manifest["shards"]),
-        "bytes": sum(entry["bytes"] for entry in manifest["shards"].values()),
+        "episodes": sum(held.values()),
+        "asked": asked and asked.episodes,
+        "missing": accounting.missing(folder, held),
+        "shards": len(entries),
+        "bytes": sum(entry["bytes"] for entry in entries.values()),
         "faults": faults,
-        "config": meta.get("config"),
-        "versions": meta.get("versions"),
+        "config": metas[0]["config"] if metas else None,
+        "versions": metas[0]["versions"] if metas else None,
+        "made_by": accounting.makers(metas),
     }
+
+
+def missing(folder: pathlib.Path) -> str | None:
+    """Say in one line which of the episodes that were asked for are not there; None where all are.
+
+    Raises:
+      UserError: there is no data set, or what was asked for cannot be read.
+    """
+    return accounting.missing(folder, accounting.held(_read_manifest(folder)["shards"]))
 
 
 def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | SettledScene:
@@ -165,9 +215,11 @@ def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | Se
 def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
     """Load a whole data set into memory (a few kilobytes an episode), after checking every shard.
 
+    Where episodes that were asked for have not been made, one line says so.
+
     Args:
       folder: the data set.
-      kind: a key of `shards.KINDS`.
+      kind: a key of `layout.KINDS`.
 
     Returns:
       The episodes `[B, ...]` in the order of the shards, and a fingerprint of the data set.
@@ -185,6 +237,12 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
         )
     if not manifest["shards"]:
         raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
+    try:
+        said = accounting.missing(folder, accounting.held(manifest["shards"]))
+    except UserError as error:  # what was asked for cannot be read; the shards are whole all the same
+        said = str(error)
+    if said:
+        console.warn(said)
     parts = [shards.read_shard(folder / name, kind=kind) for name in manifest["shards"]]
     widths = {part.scene.shape.shape[1] for part in parts}
     if len(widths) > 1:

@@ -1,35 +1,33 @@
 """Shards of a data set: Parquet files of episodes. Only this module reads and writes them.
 
 Every column is a leaf of an episode struct, flattened, and quantized as `codec` says; its shape, dtype and quantum,
-the schema version, the kind, the config and the versions of the packages that made it are in the shard's own metadata.
-A shard is written under a temporary name, synced and renamed, so a file with a shard's name is whole or was damaged
-later, which its SHA-256 in the manifest (`records`) shows.
+the schema version, the kind, the config, the versions of the packages and the kind of processor that made it are in
+the shard's own metadata. A shard is written under a temporary name, synced and renamed, so a file with a shard's name
+is whole or was damaged later, which its SHA-256 in the manifest (`records`) shows. Whatever is in a file, reading it
+ends with episodes or with a `UserError`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dipn_jax import files, structs
+from dipn_jax import files, machine, typed
 from dipn_jax.errors import UserError
-from dipn_jax.storage import codec
+from dipn_jax.storage import codec, layout
+from dipn_jax.storage.layout import KINDS
 
 SCHEMA_VERSION = 2
 """Version of the format; shards of another version are refused."""
 COMPRESSION_LEVEL = 9
 """Level of zstd; it takes a few milliseconds a shard, because bytes of the same place of all numbers are neighbours."""
-KINDS: dict[str, type] = {
-    "push": structs.PushEpisode,
-    "grasp": structs.GraspEpisode,
-    "images": structs.SettledScene,
-}
-"""Kinds of data sets, and the struct of their episodes."""
 ROUNDED_START = "rounded"
 """Entry `start` of the metadata: episodes were simulated from what is stored, so they can be simulated again exactly.
 
@@ -42,10 +40,19 @@ _META_KEY = b"dipn_jax"
 class DamagedShard(UserError):
     """A file that was a shard, or has a shard's name, and cannot be read as one."""
 
+    def __init__(self, path: pathlib.Path, what: str) -> None:
+        super().__init__(f"shard {path}: {what}; run dipn-datagen repair {path.parent}")
+        self.what = what
+
 
 def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
     """Return the path of shard `index` of a data set."""
     return folder / f"shard-{index:05d}.parquet"
+
+
+def shard_files(folder: pathlib.Path) -> list[pathlib.Path]:
+    """Return what has a shard's name in a folder, in order."""
+    return sorted(folder.glob("shard-*.parquet"))
 
 
 def write_shard(
@@ -57,7 +64,7 @@ def write_shard(
       folder: the data set.
       index: the shard's number.
       episodes: a struct of `KINDS[kind]` with a leading `[B]` axis.
-      kind: a key of KINDS.
+      kind: a key of `KINDS`.
       config: what determines the data set, with its seed; it has to fit into JSON.
       faults: counts of drops and faults.
     """
@@ -76,6 +83,8 @@ def write_shard(
         "faults": faults,
         "start": ROUNDED_START,
         "versions": files.package_versions(),
+        "processor": machine.processor(),
+        "instructions": machine.instructions(),
     }
     table = pa.Table.from_arrays(arrays, names=list(columns))
     table = table.replace_schema_metadata({_META_KEY: json.dumps(meta).encode()})
@@ -92,31 +101,53 @@ def write_shard(
     files.write_atomically(shard_path(folder, index), sink.getvalue().to_pybytes())
 
 
-def read_meta(path: pathlib.Path) -> dict[str, Any]:
-    """Return the metadata of a shard.
-
-    Raises:
-      UserError: the file is missing, damaged, not a shard, or of another schema version.
-    """
+@contextlib.contextmanager
+def _reading(path: pathlib.Path) -> Iterator[None]:
+    """Turn whatever goes wrong while a shard is read into one line: what a damaged file raises, its reader decides."""
     try:
-        meta = json.loads(pq.read_schema(path).metadata[_META_KEY])
+        yield
+    except UserError:
+        raise
     except FileNotFoundError:
         raise UserError(f"shard {path}: not found; generate it again with dipn-datagen") from None
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
-        raise DamagedShard(
-            f"shard {path}: truncated, damaged or not a shard of this project; run dipn-datagen repair {path.parent}"
-        ) from None
-    if meta["schema_version"] != SCHEMA_VERSION:
-        raise UserError(
-            f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it anew elsewhere"
-        )
-    return meta
+    except OSError as error:
+        if error.errno is not None:
+            raise UserError(f"shard {path}: cannot be read ({error.strerror}); mend that and try again") from None
+        raise DamagedShard(path, "truncated, damaged or not Parquet") from None
+    except MemoryError:
+        raise UserError(f"shard {path}: not enough memory to read it; make room and try again") from None
+    except typed.Misfit as error:
+        raise DamagedShard(path, f"its metadata are damaged: {error}") from None
+    except Exception:
+        raise DamagedShard(path, "truncated, damaged or not a shard of this project") from None
+
+
+def read_meta(path: pathlib.Path) -> dict[str, Any]:
+    """Return the metadata of a shard, which agree with its columns; and under `episodes`, how many it has.
+
+    Raises:
+      UserError: the file is missing, damaged (`DamagedShard`), not a shard, or of another schema version.
+    """
+    with _reading(path):
+        found = pq.read_metadata(path)
+        schema = found.schema.to_arrow_schema()
+        meta = typed.check(typed.parse((schema.metadata or {}).get(_META_KEY, b"{}")), {"schema_version": int})
+        if meta["schema_version"] != SCHEMA_VERSION:
+            raise UserError(
+                f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it anew "
+                "elsewhere"
+            )
+        typed.check(meta, layout.META)
+        if wrong := layout.problem(meta, schema):
+            raise DamagedShard(path, wrong)
+        if found.num_rows < 1:
+            raise DamagedShard(path, "it holds no episodes")
+        return {**meta, "episodes": found.num_rows}
 
 
 def count(path: pathlib.Path) -> int:
     """Return the number of episodes in a shard."""
-    read_meta(path)
-    return pq.read_metadata(path).num_rows
+    return int(read_meta(path)["episodes"])
 
 
 def read_shard(path: pathlib.Path, *, kind: str) -> Any:
@@ -128,13 +159,15 @@ def read_shard(path: pathlib.Path, *, kind: str) -> Any:
     meta = read_meta(path)
     if meta["kind"] != kind:
         raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
-    try:
-        table = pq.read_table(path, page_checksum_verification=True)
-    except (pa.ArrowException, OSError):
-        raise DamagedShard(f"shard {path}: damaged; run dipn-datagen repair {path.parent}") from None
     columns = {}
-    for name, spec in meta["columns"].items():
-        flat = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        columns[name] = flat.astype(spec["dtype"]).reshape(len(table), *spec["shape"])
-    coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
-    return codec.assemble(KINDS[kind], codec.decode(columns, coded))
+    with _reading(path):
+        table = pq.read_table(path, page_checksum_verification=True)
+        for name, spec in meta["columns"].items():
+            column = table.column(name).combine_chunks()
+            flat = column.flatten()
+            if column.null_count or flat.null_count:
+                raise DamagedShard(path, f"its column {name} has empty places")
+            values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"])
+            columns[name] = values.reshape(meta["episodes"], *spec["shape"])
+        coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
+        return codec.assemble(KINDS[kind], codec.decode(columns, coded))

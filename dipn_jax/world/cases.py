@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -11,12 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dipn_jax import files, geometry
+from dipn_jax import files, geometry, typed
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Scene
 from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 from dipn_jax.world import scenes, shapes
 
+LARGEST = 1e6
+"""Largest number that an entry may have."""
+_OBJECT = {
+    "size_mm": (float,) * 3,
+    "position_m": (float,) * 2,
+    "quaternion_wxyz": (float,) * 4,
+    "color_rgb?": (float,) * 3,
+    "height_m?": typed.Maybe(float),
+}
+"""Form of an object, beside its shape."""
 _DATA = pathlib.Path(__file__).parents[1] / "data"
 
 
@@ -53,34 +63,37 @@ def load_cases(
     """
     path = hard_cases_path() if path is None else files.absolute(path)
     try:
-        cases = json.loads(files.read_text(path))["cases"]
+        cases = typed.check(typed.parse(path.read_bytes()), {"cases": [{"name?": object, "objects": [dict]}]})["cases"]
+        names = [_name(case.get("name", i)) for i, case in enumerate(cases)]
     except OSError as error:
         raise UserError(
             f"case file {path}: {error.strerror}; give a JSON file in the format of {hard_cases_path().name}"
         ) from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"case file {path}: not a JSON object with a list `cases` ({error!r})") from None
-    if not isinstance(cases, list) or not cases:
-        raise UserError(f"case file {path}: `cases` is not a list of at least one case")
-    for case in cases:
-        objects = case.get("objects") if isinstance(case, dict) else None
-        if not isinstance(objects, list) or not objects or not all(isinstance(entry, dict) for entry in objects):
-            raise UserError(f"case file {path}: a case without a list of `objects`; want at least one object a case")
+    except typed.Misfit as error:
+        raise UserError(
+            f"case file {path}: {error}; want a JSON object with a list `cases`, each with its list of `objects`"
+        ) from None
+    if not cases or not all(case["objects"] for case in cases):
+        raise UserError(f"case file {path}: no case, or one without objects; want at least one, and one in each case")
     most = max(len(case["objects"]) for case in cases)
     n = slots or most
     if most > n:
         raise UserError(f"case file {path}: a case has {most} objects, but there are {n} slots")
-    names = [str(case.get("name", i)) for i, case in enumerate(cases)]
     if len(set(names)) < len(names):
         raise UserError(f"case file {path}: two cases have the same name; give each its own")
-    loaded = [_case(case, n, path) for case in cases]
+    loaded = [
+        _case(case["objects"], n, f"case file {path}, case {name}") for name, case in zip(names, cases, strict=True)
+    ]
     scene = jax.tree.map(lambda *leaves: np.stack(leaves), *[scene for scene, _ in loaded])
     return names, scene, np.stack([p for _, p in loaded])
 
 
-def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, Float[np.ndarray, "{n} 7"]]:
-    objects = case["objects"]
-    where = f"case file {path}, case {case.get('name', '?')}"
+def _name(value: Any) -> str:
+    """Return the name of a case: a text or a number."""
+    return str(value) if type(value) in (int, float) else str(typed.check(value, str, at="the name of a case"))
+
+
+def _case(objects: list[dict[str, Any]], n: int, where: str) -> tuple[Scene, Float[np.ndarray, "{n} 7"]]:
     shape = np.full(n, ABSENT, np.int32)
     size = np.full((n, 3), 0.05, np.float32)
     color = np.zeros((n, 3), np.float32)
@@ -88,16 +101,19 @@ def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, Floa
     for i, entry in enumerate(objects):
         name = entry.get("shape")
         if name not in shapes.CLASSES:
-            raise UserError(f"{where}, object {i}: unknown shape {name!r}; want one of {', '.join(shapes.CLASSES)}")
-        try:
-            size[i] = _numbers(entry["size_mm"], 3) / 1000
-            position = _numbers(entry["position_m"], 2)
-            quat = _numbers(entry["quaternion_wxyz"], 4)
-            color[i] = _numbers(entry.get("color_rgb", shapes.COLORS_RGB[i % 10]), 3) / 255
-            height = None if entry.get("height_m") is None else float(entry["height_m"])
-        except (KeyError, TypeError, ValueError) as error:
             raise UserError(
-                f"{where}, object {i}: {error!r}; want size_mm [3], position_m [2], quaternion_wxyz [4]"
+                f"{where}, object {i}: unknown shape {typed.brief(name)!r}; want one of {', '.join(shapes.CLASSES)}"
+            )
+        try:
+            typed.check(entry, _OBJECT)
+            size[i] = _numbers(entry["size_mm"]) / 1000
+            position = _numbers(entry["position_m"])
+            quat = _numbers(entry["quaternion_wxyz"])
+            color[i] = _numbers(entry.get("color_rgb", shapes.COLORS_RGB[i % 10])) / 255
+            height = None if entry.get("height_m") is None else float(_numbers([entry["height_m"]])[0])
+        except typed.Misfit as error:
+            raise UserError(
+                f"{where}, object {i}: {error}; want size_mm [3], position_m [2], quaternion_wxyz [4]"
             ) from None
         if size[i].min() < 0.005 or np.linalg.norm(size[i]) > shapes.MAX_DIAGONAL:
             raise UserError(
@@ -128,8 +144,12 @@ def _case(case: dict[str, Any], n: int, path: pathlib.Path) -> tuple[Scene, Floa
     return scenes.nominal(Scene(shape, size, color, np.zeros(n), np.zeros(n))), poses
 
 
-def _numbers(values: Any, length: int) -> Float[np.ndarray, " {length}"]:
-    array = np.asarray(values, np.float32)
-    if array.shape != (length,) or not np.isfinite(array).all():
-        raise ValueError(f"{values} is not {length} finite numbers")
-    return array
+def _numbers(values: Sequence[float]) -> Float[np.ndarray, " _"]:
+    """Return numbers as an array.
+
+    Raises:
+      Misfit: one of them is too large.
+    """
+    if max(map(abs, values)) > LARGEST:
+        raise typed.Misfit(f"{values} has a number above {LARGEST:g}")
+    return np.asarray(values, np.float32)

@@ -83,7 +83,7 @@ def clear(
       given: options, for `settings.json`.
       runs: networks that `decide` uses.
       longest: metres of the longest push.
-      remember: whether the scores of grasps like one that missed are halved.
+      remember: whether the scores of grasps like one that missed are halved as long as the table looks the same.
 
     Returns:
       The metrics.

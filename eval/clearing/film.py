@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import io
 import pathlib
-import zipfile
 import zlib
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
-from dipn_jax import files
+from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.sight import imagine, masks, render
+from dipn_jax.storage import arrays
 from dipn_jax.structs import Array, Scene
 from dipn_jax.workspace import WORKSPACE
 
@@ -57,6 +57,24 @@ class Film:
         return np.asarray(seen.color), np.asarray(predicted.color), np.asarray(after.color)
 
 
+_FORM = {
+    "what": arrays.Form("U", ("T",)),
+    "shape": arrays.Form("iu", ("T + 1", "N")),
+    "poses": arrays.Form("f", ("T + 1", "N", 7)),
+    "push": arrays.Form("f", ("T", 4)),
+    "grasp": arrays.Form("iuf", ("T", 3)),
+    "values": arrays.Form("f", ("T", 3)),
+    "motion": arrays.Form("f", ("T", "masks", 3)),
+    "label": arrays.Form("iu", ("T", WORKSPACE.pixels, WORKSPACE.pixels)),
+    "missed": arrays.Form("iuf", ("T", "M", 3)),
+    "size": arrays.Form("f", ("N", 3)),
+    "color": arrays.Form("f", ("N", 3)),
+    "mass": arrays.Form("f", ("N",)),
+    "friction": arrays.Form("f", ("N",)),
+}
+"""Arrays of a file."""
+
+
 def packed(label: Int[Array, "H W"]) -> np.ndarray:
     """Return labels compressed, to be kept in an interrupted evaluation."""
     return np.frombuffer(zlib.compress(np.asarray(label, np.int8).tobytes()), np.uint8)
@@ -78,7 +96,7 @@ def save(path: pathlib.Path, instance: Instance) -> None:
     steps["poses"] = np.concatenate([steps["poses"], instance.poses[None]])
     scene = {key: getattr(instance.scene, key) for key in ("size", "color", "mass", "friction")}
     stream = io.BytesIO()
-    np.savez_compressed(stream, what=np.array(instance.did), **steps, **scene)
+    np.savez_compressed(stream, allow_pickle=False, what=np.array(instance.did), **steps, **scene)
     files.write_atomically(path, stream.getvalue())
 
 
@@ -89,9 +107,11 @@ def load(path: pathlib.Path) -> Film:
       UserError: it is missing, damaged or not a film.
     """
     try:
-        with np.load(path) as arrays:
-            return Film(**{field.name: arrays[field.name] for field in dataclasses.fields(Film)})
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        found = arrays.read(path, _FORM)
+        if len(found["shape"]) != len(found["what"]) + 1 or not len(found["what"]):
+            raise typed.Misfit(f"{len(found['what'])} actions, {len(found['shape'])} states")
+    except typed.Misfit as error:
         raise UserError(
-            f"{path}: missing, damaged or no film; run the dipn-eval command that writes it again"
+            f"{path}: missing, damaged or no film ({error}); run the dipn-eval command that writes it again"
         ) from None
+    return Film(**found)

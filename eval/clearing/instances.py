@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import zlib
 
 import numpy as np
 
 from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
+from dipn_jax.planning.memory import MissedGrasps
 from dipn_jax.storage import plain
 from dipn_jax.structs import Fault, Scene
 from dipn_jax.world import cases as case_files
@@ -32,13 +34,14 @@ class Instance:
     scene: Scene  # numpy, [N]
     poses: np.ndarray  # [N, 7]
     objects: int
+    number: int = 0  # of its random keys; it does not depend on the other tables
     grasps: int = 0
     pushes: int = 0
     removed: int = 0
     held: int = 0  # grasps that held something
     ended: str = ""  # cleared, pushed out, out of actions, fault
     did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action
-    missed: tuple[np.ndarray, ...] = ()  # grasps [3] that missed and around which nothing has moved since
+    missed: MissedGrasps = dataclasses.field(default_factory=MissedGrasps)  # and the table looks as then
     film: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)  # poses and decision before each action
 
     @property
@@ -105,7 +108,8 @@ def random_instances(
 
 
 def _instances(names: list[str], scene: Scene, poses: np.ndarray) -> list[Instance]:
+    numbers = [zlib.crc32(f"{name}/{names[:i].count(name)}".encode()) for i, name in enumerate(names)]
     return [
-        Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()))
+        Instance(name, structs.take(scene, i), poses[i], int((scene.shape[i] >= 0).sum()), numbers[i])
         for i, name in enumerate(names)
     ]

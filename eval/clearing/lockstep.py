@@ -11,12 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
-from dipn_jax import console, files, geometry, seeds, structs
+from dipn_jax import console, files, seeds, structs
 from dipn_jax.engine import Engine
-from dipn_jax.planning import planner
 from dipn_jax.storage import resume
-from dipn_jax.structs import Decision, Fault
+from dipn_jax.structs import Array, Decision, Fault
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 from dipn_jax.world import clutter, primitives
 
@@ -27,13 +27,6 @@ from .on_tables import TablePolicy
 
 ACTIONS_PER_OBJECT = 3
 """Most actions per object; a table that needs more is not cleared. Source: the paper."""
-REMEMBERED_MISSES = 8
-"""Number of the latest grasps that missed that are remembered."""
-MOVED_DISTANCE = 0.005
-"""Metres by which an object must move for grasps near it to be worth trying again."""
-NEAR_GRASP = 0.06
-"""Metres from the centre of a grasp within which an object counts as near it."""
-_NONE_MISSED = np.repeat(planner.NONE_MISSED, REMEMBERED_MISSES, axis=0)
 
 
 def clear(
@@ -57,7 +50,7 @@ def clear(
       partial: where an interrupted evaluation is kept.
       seed: random seed of the push candidates.
       longest: metres of the longest push that `decide` asks for.
-      remember: give `decide` the grasps that missed and near which nothing has moved since.
+      remember: give `decide` the grasps that missed, as long as the table looks the same around them.
 
     Returns:
       The instances, ended.
@@ -69,17 +62,16 @@ def clear(
             rows = [instances[number] for number in active]
             before = sum(instance.removed for instance in instances)
             scene, poses = structs.stack([row.scene for row in rows]), np.stack([row.poses for row in rows])
-            now = jnp.stack([action_key(seed, number, instances[number].actions) for number in active])
-            missed = np.stack([_missed(row) if remember else _NONE_MISSED for row in rows])
-            decision, label = decide(now, scene, poses, missed)
+            now = jnp.stack([action_key(seed, row.number, row.actions) for row in rows])
+            decision, seen = decide(now, scene, poses, functools.partial(_recall, rows))
             for is_push, act in ((True, functools.partial(_push, longest=longest)), (False, _grasp)):
                 which = np.flatnonzero(decision.is_push == is_push)
                 if len(which):
                     act([rows[i] for i in which], decision[which], engine)
             for i, instance in enumerate(rows):
-                state = np.asarray(scene.shape[i]), poses[i]
-                _record(instance, state, decision[i], np.asarray(label[i]), missed[i])
-                _update_missed(instance, state, np.asarray(decision.grasp_pixel[i]))
+                _record(instance, np.asarray(scene.shape[i]), poses[i], decision[i], np.asarray(seen.label[i]))
+                if remember and instance.did[-1] == "grasp missed":
+                    instance.missed = instance.missed.add(decision.grasp_pixel[i], seen.height[i])
                 instance.ended = instance.ended or _ended(instance)
             partial.save(instances)
             removed = sum(instance.removed for instance in instances) - before
@@ -89,7 +81,7 @@ def clear(
 
 
 def action_key(seed: int, number: int, action: int) -> jax.Array:
-    """Return the random key of one action on one table: of the noise of its image, and of the push candidates."""
+    """Return the random key of one action on the table of a `number`: of the noise of its image, and of candidates."""
     return jax.random.fold_in(jax.random.fold_in(seeds.key(seed, seeds.Purpose.CLEARING_CANDIDATES), number), action)
 
 
@@ -117,43 +109,28 @@ def _grasp(rows: list[Instance], decision: Decision, engine: Engine) -> None:
         instance.did.append("grasp held" if held[i].any() else "grasp missed")
 
 
-def _record(
-    instance: Instance,
-    state: tuple[np.ndarray, np.ndarray],
-    decision: Decision,
-    label: np.ndarray,
-    missed: np.ndarray,
-) -> None:
+def _recall(rows: list[Instance], heights: Float[Array, "B H W"]) -> Int[np.ndarray, "B M 3"]:
+    """Forget misses around which the tables look changed, and return those that remain."""
+    for instance, height in zip(rows, heights, strict=True):
+        instance.missed = instance.missed.recall(height)
+    return np.stack([instance.missed.pixels() for instance in rows])
+
+
+def _record(instance: Instance, shape: np.ndarray, poses: np.ndarray, decision: Decision, label: np.ndarray) -> None:
     """Record what an episode's pictures can be made from: the poses before the action, what was known, the decision."""
     push = decision.push
     instance.film.append(
         {
-            "shape": state[0],
-            "poses": state[1],
+            "shape": shape,
+            "poses": poses,
             "push": np.array([*push.start, push.angle, push.distance], np.float32),
             "grasp": np.asarray(decision.grasp_pixel),
             "values": np.array([decision.grasp_score, decision.value_now, decision.value_push], np.float32),
             "motion": np.asarray(decision.motion, np.float32),
             "label": film.packed(label),
-            "missed": missed,
+            "missed": instance.missed.pixels(),
         }
     )
-
-
-def _missed(instance: Instance) -> np.ndarray:
-    """Return the grasps that missed, padded to `[REMEMBERED_MISSES, 3]`."""
-    return np.stack([*instance.missed, *_NONE_MISSED[len(instance.missed) :]])
-
-
-def _update_missed(instance: Instance, state: tuple[np.ndarray, np.ndarray], grasp: np.ndarray) -> None:
-    """Remember a grasp that missed, and forget those near which an object has moved or is gone."""
-    shape, poses = state
-    missed = instance.missed + ((grasp,) if instance.did[-1] == "grasp missed" else ())
-    stayed = np.linalg.norm(instance.poses[:, :2] - poses[:, :2], axis=-1) < MOVED_DISTANCE
-    moved = poses[(shape >= 0) & ~(stayed & (instance.scene.shape >= 0)), :2]
-    apart = [np.linalg.norm(moved - np.asarray(geometry.pixels_to_metres(each[:0:-1])), axis=-1) for each in missed]
-    kept = tuple(each for each, away in zip(missed, apart, strict=True) if (away > NEAR_GRASP).all())
-    instance.missed = kept[-REMEMBERED_MISSES:]
 
 
 def _ended(instance: Instance) -> str:

@@ -19,9 +19,10 @@ from dipn_jax.structs import Array, Decision, Observation, Scene
 from . import rollouts
 from .camera import DEFAULT_CAMERA, Camera
 
-TablePolicy = Callable[[jax.Array, Scene, Array, Array], tuple[Decision, Array]]
-"""(keys [B], scenes [B, N], poses [B, N, 7], grasps that missed [B, M, 3]) -> brief decisions [B], and the masks
-[B, H, W] that they rest on; both NumPy."""
+Recall = Callable[[Array], Array]
+"""height maps [B, H, W] metres -> grasps (rotation, row, col) that missed on the tables as they look [B, M, 3]."""
+TablePolicy = Callable[[jax.Array, Scene, Array, Recall], tuple[Decision, Observation]]
+"""(keys [B], scenes [B, N], poses [B, N, 7], recall) -> brief decisions [B], and what was seen [B]; both NumPy."""
 
 
 def load(
@@ -55,10 +56,10 @@ def load(
 def in_lockstep(policy: Policy, *, camera: Camera = DEFAULT_CAMERA) -> TablePolicy:
     """Make a policy of one table into one of many, which are looked at and decided on together."""
 
-    def decide(keys: jax.Array, scene: Scene, poses: Array, missed: Array) -> tuple[Decision, Array]:
+    def decide(keys: jax.Array, scene: Scene, poses: Array, recall: Recall) -> tuple[Decision, Observation]:
         seen = camera.look(keys, scene, poses)
         each = functools.partial(_decide_each, act=policy.act, rule=policy.rule, distances=policy.distances)
-        return batching.in_small_batches(each, keys, seen, missed), seen.label
+        return batching.in_small_batches(each, keys, seen, recall(seen.height)), seen
 
     return decide
 

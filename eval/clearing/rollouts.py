@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -12,7 +13,7 @@ from dipn_jax.engine import Engine
 from dipn_jax.planning import planner
 from dipn_jax.planning.planner import Rule
 from dipn_jax.sight import masks, render
-from dipn_jax.structs import Array, Candidates, Decision, Fault, Scene
+from dipn_jax.structs import Array, Candidates, Decision, Fault, Observation, Scene
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import primitives, scenes
 
@@ -21,21 +22,21 @@ def decide(
     keys: jax.Array,
     scene: Scene,
     poses: Array,
-    missed: Array,
+    recall: Callable[[Array], Array],
     *,
     scorer: planner.Scorer,
     summarize: planner.ScoreSummary,
     engine: Engine,
     rule: Rule,
     distances: np.ndarray,
-) -> tuple[Decision, Array]:
+) -> tuple[Decision, Observation]:
     """Decide on the tables `[B]` by Alg. 2 with the engine as predictor: it knows shapes, guesses mass and friction.
 
     Args:
       keys: `[B]` random keys, for the candidates.
       scene: `[B, N]`; masses and frictions are replaced by nominal ones.
       poses: `[B, N, 7]`.
-      missed: `[B, M, 3]` grasps that missed.
+      recall: gives the grasps that missed, `[B, M, 3]`, from height maps `[B, H, W]`.
       scorer: scores of every grasp.
       summarize: mean and highest score of all grasps on predicted images.
       engine: physics engine.
@@ -43,15 +44,15 @@ def decide(
       distances: `[P]` metres of the candidates.
 
     Returns:
-      Brief decisions `[B]`, and the simulator's masks `[B, H, W]`.
+      Brief decisions `[B]`, and what was seen, with the simulator's masks, `[B]`.
     """
+    seen: Observation = jax.device_get(render.observe(scene, poses))
     find = functools.partial(_find_candidates, scorer=scorer, rule=rule, distances=distances)
-    found = batching.in_small_batches(find, keys, scene, poses, missed)
+    found = batching.in_small_batches(find, keys, scene, poses, recall(seen.height))
     motion, usable = _motions(engine, scene, poses, found, max(float(max(distances)), PUSH_STEPS * 0.01))
     found = found.replace(feasible=found.feasible & usable)
     choose = functools.partial(_decide_among, summarize=summarize, rule=rule)
-    label = np.asarray(render.observe(scene, poses).label)
-    return batching.in_small_batches(choose, scene, poses, found, motion), label
+    return batching.in_small_batches(choose, scene, poses, found, motion), seen
 
 
 @functools.partial(jax.jit, static_argnames="scorer")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from dipn_jax import console
-from dipn_jax.names import EngineName
+from dipn_jax.names import ALL_AIDS, Aid, EngineName
 
 from .. import options
 from . import evaluation
@@ -33,6 +33,7 @@ def sweep(
     pushes: int = 200,
     gamma: float = 0.9,
     threshold: float = 0.7,
+    aids: tuple[Aid, ...] = ALL_AIDS,
     seed: int = 1_000_000,
     engine: EngineName = "auto",
     threads: int | None = None,
@@ -53,6 +54,7 @@ def sweep(
       pushes: scenes of 1 to 7 objects, a push in each, for the prediction error; 0: do not measure it.
       gamma: discount of a push's value.
       threshold: grasp at once above this score.
+      aids: what no paper has, as of dipn-eval clear.
       seed: random seed of scenes, perturbations and candidates.
       engine: physics engine.
       threads: that native simulates on; one a core if not given.
@@ -67,7 +69,7 @@ def sweep(
 
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
-    chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold)
+    chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold, aids=aids)
     evaluation.check(out, seed, chosen, tables)
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
     configs[sweeping.CHOSEN] = chosen
@@ -103,12 +105,13 @@ def _clear_with_each(
     runs = networks.runs("dipn+gn")
     longest = max(max(config.distances) for config in configs.values())
     ended: dict[str, dict[str, Any]] = kept.load({})
+    remember = "memory" in given["aids"]
     policies = on_tables.load("dipn+gn", networks, physics, list(configs.values()), camera=camera)
     for name, decide in zip(configs, policies, strict=True):
         if name not in ended:
             named = given | {"label": name}
             ended[name] = evaluation.clear(
-                out / name, decide, physics, tables, given=named, runs=runs, longest=longest, remember=True
+                out / name, decide, physics, tables, given=named, runs=runs, longest=longest, remember=remember
             )
             kept.save(ended)
     return {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}

@@ -48,8 +48,7 @@ def grasp(
       seed: random seed of scenes and random grasps; the scenes are never those of training data.
       others: where a grasp missed, also try this many of the next best ones, to see what physics allows; they are
         ranked as the policy ranked them, from the same image and with the same memory of misses.
-      aids: what no paper has, as of dipn-eval clear; memory: a grasp that missed is remembered until something near it
-        moves.
+      aids: what no paper has, as of dipn-eval clear; still is not about grasps.
       camera: what GN sees; masks do not matter to it.
       engine: physics engine.
       threads: that native simulates on; one a core if not given.
@@ -85,7 +84,7 @@ def grasp(
             seed=seed,
             others=others,
             camera=camera,
-            remember="memory" in aids,
+            aids=aids,
         )
         alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
         values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}

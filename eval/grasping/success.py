@@ -15,6 +15,7 @@ import numpy as np
 
 from dipn_jax import batching, console, seeds, structs
 from dipn_jax.engine import Engine
+from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.planning import candidates, methods
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
@@ -44,7 +45,7 @@ def evaluate(
     seed: int,
     others: int = 0,
     camera: Camera = DEFAULT_CAMERA,
-    remember: bool = True,
+    aids: tuple[Aid, ...] = ALL_AIDS,
 ) -> tuple[dict[str, Any], list[Instance]]:
     """Try the best-scored grasp until every table is empty, by the end rules of `eval.clearing`; also a random one.
 
@@ -57,15 +58,16 @@ def evaluate(
       seed: random seed of the scenes and of the random grasps.
       others: where a grasp missed, how many of the next best to try, each from the same state; 0: none.
       camera: what the scorer sees.
-      remember: halve the scores of grasps like one that missed until something near them moves.
+      aids: those of choosing a grasp that are not the scorer's, `top` and `memory`.
 
     Returns:
       Flat metrics: success with bootstrap 95 % intervals over tables, calibration; and the tables, ended.
     """
     tables = instances.random_instances(engine, config, count=scenes, seed=seed, purpose=Purpose.GRASP_TABLES)
-    result = _random_foreground(scorer, engine, tables, seed)
-    decide = on_tables.in_lockstep(methods.grasping_policy(scorer), camera=camera)
-    tables = lockstep.clear(tables, engine, decide, partial, seed=seed, remember=remember)
+    result = _random_foreground(scorer, engine, tables, seed, camera)
+    policy = methods.grasping_policy(scorer, methods.PolicyConfig(aids=aids))
+    decide = on_tables.in_lockstep(policy, camera=camera)
+    tables = lockstep.clear(tables, engine, decide, partial, seed=seed, remember="memory" in aids)
     held = [np.array([did == "grasp held" for did in table.did], float) for table in tables]
     scores = np.concatenate([[step["values"][0] for step in table.film] for table in tables])
     result |= _rate("gn", [each.sum() for each in held], [len(each) for each in held])
@@ -83,12 +85,15 @@ def _rate(name: str, hits: Any, trials: Any) -> dict[str, float]:
     return {f"grasp_success/{name}": value, f"grasp_success/{name}_low": low, f"grasp_success/{name}_high": high}
 
 
-def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], seed: int) -> dict[str, Any]:
+def _random_foreground(
+    scorer: Scorer, engine: Engine, tables: list[Instance], seed: int, camera: Camera
+) -> dict[str, Any]:
     """Try a grasp of a random foreground pixel on each table; return how it went and what the scorer said."""
     scene = structs.stack([table.scene for table in tables])
     poses = np.stack([table.poses for table in tables])
     keys = jax.random.split(seeds.key(seed, Purpose.RANDOM_GRASPS), len(tables))
-    grasps, scores = batching.in_batches(functools.partial(_random_grasp, scorer=scorer), keys, scene, poses)
+    seen = camera.look(keys, scene, poses)
+    grasps, scores = batching.in_batches(functools.partial(_random_grasp, scorer=scorer), keys, seen)
     rollout, outcome = primitives.grasp(engine, scene, poses, jax.device_get(grasps))
     good = Fault.usable(rollout.fault)
     success = np.asarray(outcome.success, float)[good]
@@ -97,15 +102,15 @@ def _random_foreground(scorer: Scorer, engine: Engine, tables: list[Instance], s
 
 
 @functools.partial(jax.jit, static_argnames="scorer")
-def _random_grasp(keys: jax.Array, scene: Scene, poses: jax.Array, *, scorer: Scorer) -> tuple[Grasp, jax.Array]:
-    def one(args: tuple[jax.Array, Scene, jax.Array]) -> tuple[Grasp, jax.Array]:
-        seen = render.render(*args[1:])
-        grasps = candidates.random_grasps(args[0], seen, count=1)
+def _random_grasp(keys: jax.Array, seen: Observation, *, scorer: Scorer) -> tuple[Grasp, jax.Array]:
+    def one(args: tuple[jax.Array, Observation]) -> tuple[Grasp, jax.Array]:
+        key, seen = args
+        grasps = candidates.random_grasps(key, seen, count=1)
         chosen: Grasp = jax.tree.map(lambda leaf: leaf[0], grasps)
         rotation, row, col = candidates.grasp_index(chosen)
         return chosen, scorer(render.rgbd(seen)[None])[0, rotation, row, col]
 
-    return jax.lax.map(one, (keys, scene, poses))
+    return jax.lax.map(one, (keys, seen))
 
 
 def _other_grasps(
@@ -131,16 +136,14 @@ def _other_grasps(
     if not misses:
         return result
     steps = [tables[number].film[action] for number, action in misses]
-    states = [
-        (tables[number].scene.replace(shape=step["shape"]), step["poses"], step["missed"])
-        for (number, _), step in zip(misses, steps, strict=True)
-    ]
-    scene, poses = structs.stack([state[0] for state in states]), np.stack([state[1] for state in states])
-    keys = jnp.stack([lockstep.action_key(seed, *miss) for miss in misses])
-    seen, missed = camera.look(keys, scene, poses), np.stack([state[2] for state in states])
-    grasps = batching.in_batches(functools.partial(_next_best, scorer=scorer, count=count), seen, missed)
+    scenes = [tables[n].scene.replace(shape=step["shape"]) for (n, _), step in zip(misses, steps, strict=True)]
+    scene = structs.stack(scenes)
+    poses, missed, tried = (np.stack([step[key] for step in steps]) for key in ("poses", "missed", "grasp"))
+    keys = jnp.stack([lockstep.action_key(seed, tables[number].number, action) for number, action in misses])
+    seen = camera.look(keys, scene, poses)
+    grasps = batching.in_batches(functools.partial(_next_best, scorer=scorer, count=count), seen, missed, tried)
     flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
-    index = np.repeat(np.arange(len(states)), count)
+    index = np.repeat(np.arange(len(steps)), count)
     held, begin = [], 0
     with console.Progress("other grasps", len(index), unit="grasps") as progress:
         while begin < len(index):
@@ -159,14 +162,14 @@ def _other_grasps(
 
 
 @functools.partial(jax.jit, static_argnames=("scorer", "count"))
-def _next_best(seen: Observation, missed: jax.Array, *, scorer: Scorer, count: int) -> Grasp:
-    def one(args: tuple[Observation, jax.Array]) -> Grasp:
-        image, known = args
+def _next_best(seen: Observation, missed: jax.Array, tried: jax.Array, *, scorer: Scorer, count: int) -> Grasp:
+    def one(args: tuple[Observation, jax.Array, jax.Array]) -> Grasp:
+        image, known, first = args
         scores = candidates.discount_missed(scorer(render.rgbd(image)[None])[0], known)
-        best = candidates.best_grasps(scores, count=count + 1)[1:]  # without the one that missed
+        best = candidates.best_grasps(candidates.without(scores, first), count=count)
         return candidates.grasp_at(best, image.height)
 
-    return jax.lax.map(one, (seen, missed))
+    return jax.lax.map(one, (seen, missed, tried))
 
 
 def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: int, each: int = 4) -> dict[str, float]:

@@ -110,7 +110,7 @@ def _save_pictures(out: pathlib.Path, films: dict[str, np.ndarray], values: dict
     from .. import curves
 
     out.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(out / "films.npz", **films)  # type: ignore[arg-type]
+    np.savez_compressed(out / "films.npz", allow_pickle=False, **films)
     for which in ("all", "moved") if curve else ():
         curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
         files.write_text(out / f"curve-{which}.md", curves.push_table(values, which=which))

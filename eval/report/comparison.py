@@ -9,10 +9,10 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import files
+from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 
-from .. import drawing, metrics
+from .. import drawing
 from ..clearing import film, lockstep
 from . import paper
 
@@ -20,6 +20,8 @@ FRAMES = 10
 """Number of pictures in a filmstrip."""
 FILM_ROWS = 4
 """Number of steps in the figure of predictions."""
+COUNTS = ("instances", "grasps", "pushes")
+"""Metrics that are numbers of something."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",
@@ -30,17 +32,45 @@ CAUSES = {
 """How a table can end, and how the report says it."""
 
 
+_SETTINGS = {"method": str, "label": str, "tables.cases": str, "tables.objects": object}
+"""Form of `settings.json`."""
+_EPISODE = {
+    "name": str,
+    "file": str,
+    "ended": {"cleared", "pushed out", "out of actions", "fault"},
+    "objects": typed.Whole(1),
+    "removed": typed.Whole(),
+    "grasps": typed.Whole(),
+    "pushes": typed.Whole(),
+}
+"""Form of an entry of `episodes.json`."""
+
+
 class Cleared:
     """The results in the folder of a `dipn-eval clear`."""
 
     def __init__(self, folder: pathlib.Path) -> None:
         self.folder = folder
-        self.values = metrics.read(folder)
-        settings = files.read_json(folder / "settings.json")
+        self.values = files.read_json(folder / "metrics.json", wanted={str: typed.Maybe(float)})
+        files.read_json(folder / "metrics.json", wanted=dict.fromkeys(COUNTS, typed.Whole()))
+        settings = files.read_json(folder / "settings.json", wanted=_SETTINGS)
         self.method, self.label = settings["method"], settings["label"]
         cases = settings["tables.cases"]
         self.tables = _tables_name(cases, settings["tables.objects"])
-        self.episodes = files.read_json(folder / "episodes.json", wanted=list)
+        self.episodes = files.read_json(folder / "episodes.json", wanted=[_EPISODE])
+        if not self.episodes:
+            raise UserError(f"{folder / 'episodes.json'}: lists no table; give a folder that dipn-eval clear wrote")
+
+    def film(self, entry: dict[str, Any]) -> film.Film:
+        """Return the film of a table that is listed.
+
+        Raises:
+          UserError: it is damaged, or listed under a name that leads out of the folder.
+        """
+        try:
+            return film.load(typed.inside(self.folder, entry["file"]))
+        except typed.Misfit as error:
+            raise UserError(f"{self.folder / 'episodes.json'}: {error}; clear the tables again") from None
 
     @property
     def name(self) -> str:
@@ -73,8 +103,9 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     parts, figures = ["<h2>Clearing tables</h2>"], {}
     for tables in dict.fromkeys(one.tables for one in all_cleared):
         rows = [one for one in all_cleared if one.tables == tables]
-        parts.append(f"<h3>{drawing.escaped(tables)}</h3>{_table(rows, paper.TABLE.get(tables, {}))}")
-        parts.append(f"<p>Why tables were not cleared:</p>{_causes(rows)}{{course-{tables}}}")
+        results, causes = results_and_causes(rows)
+        parts.append(f"<h3>{drawing.escaped(tables)}</h3>{results}")
+        parts.append(f"<p>Why tables were not cleared:</p>{causes}{{course-{tables}}}")
         figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
             place = f"clear-{tables}-{number}"
@@ -93,11 +124,16 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     return "".join(parts), figures
 
 
+def results_and_causes(rows: list[Cleared]) -> tuple[str, str]:
+    """Return the HTML tables of results on the same tables, beside the paper's, and of why some were not cleared."""
+    return _table(rows, paper.TABLE.get(rows[0].tables, {})), _causes(rows)
+
+
 def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> str:
     head = ["", "tables", "grasps", "pushes", *[f"{column.replace('_', ' ')} %" for column in paper.COLUMNS]]
     lines = []
     for one in rows:
-        counts = [str(one.values[key]) for key in ("instances", "grasps", "pushes")]
+        counts = [str(one.values[key]) for key in COUNTS]
         lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in paper.COLUMNS]])
     for method, numbers in published.items():
         lines.append([f"{method}, the paper", "", "", "", *[f"{number:.1f}" for number in numbers]])
@@ -107,7 +143,7 @@ def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> s
 def _cause(one: Cleared, entry: dict[str, Any]) -> str:
     """Return why a table ended, one of CAUSES: an object can leave the workspace at a push or at a grasp."""
     ended = str(entry["ended"])
-    grasped = ended == "pushed out" and str(film.load(one.folder / entry["file"]).what[-1]) != "push"
+    grasped = ended == "pushed out" and str(one.film(entry).what[-1]) != "push"
     return "thrown out" if grasped else ended
 
 
@@ -135,7 +171,7 @@ def course(one: Cleared, at: np.ndarray) -> np.ndarray:
     """Return the share of objects left after `at [A]` actions per object, averaged over tables: `[A]`."""
     shares = []
     for entry in one.episodes:
-        left = (film.load(one.folder / entry["file"]).shape >= 0).sum(1) / entry["objects"]
+        left = (one.film(entry).shape >= 0).sum(1) / entry["objects"]
         shares.append(np.interp(at * entry["objects"], np.arange(len(left)), left))
     return np.mean(shares, axis=0)
 
@@ -163,7 +199,7 @@ def _films(one: Cleared) -> Any:
     chosen = [ranked[0], ranked[len(ranked) // 2], ranked[-1]]
     figure, axes = plt.subplots(3, FRAMES, figsize=(1.5 * FRAMES, 5.4), squeeze=False)
     for row, (which, entry) in enumerate(zip(("best", "median", "worst"), chosen, strict=True)):
-        reel = film.load(one.folder / entry["file"])
+        reel = one.film(entry)
         steps = np.unique(np.linspace(0, len(reel.what) - 1, FRAMES).round().astype(int))
         for axis in axes[row]:
             axis.axis("off")
@@ -188,7 +224,7 @@ def _steps(all_cleared: list[Cleared]) -> Any:
     steps = []
     for one in sorted(all_cleared, key=lambda one: one.method != "dipn+gn"):
         for entry in one.episodes:
-            reel = film.load(one.folder / entry["file"])
+            reel = one.film(entry)
             steps += [(entry["name"], i, reel) for i in range(len(reel.what))]
     steps.sort(key=lambda step: (str(step[2].what[step[1]]) != "push", step[1]))
     chosen = steps[:FILM_ROWS]

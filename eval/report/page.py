@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import html
-import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -13,10 +12,10 @@ import matplotlib
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt
-import numpy as np
 
-from dipn_jax import files
+from dipn_jax import files, typed
 from dipn_jax.errors import UserError
+from dipn_jax.storage import arrays
 
 from .. import drawing, metrics
 from ..clearing import sweeping
@@ -24,6 +23,13 @@ from . import comparison
 
 FILM_ROWS = 4
 """Number of pushes in the figure of predictions."""
+_FILMS = {
+    "before": arrays.Form("fu", ("pushes", "H", "W", 3)),
+    "predicted": arrays.Form("fu", ("pushes", "H", "W", 3)),
+    "after": arrays.Form("fu", ("pushes", "H", "W", 3)),
+    "push": arrays.Form("f", ("pushes", 4)),
+}
+"""Arrays of the pictures of predictions."""
 _STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:right}
 td:first-child,th:first-child{text-align:left}img{max-width:100%}h2{margin-top:2em}.note{color:#666}"""
@@ -88,8 +94,10 @@ def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, An
         if sources.runs:
             figures["curves"] = _curves(sources.runs)
             parts.append("<h2>Learning curves</h2>{curves}")
-    except (KeyError, TypeError) as error:
-        raise UserError(f"report: a folder lacks {error}; give the folders that dipn-eval wrote") from None
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise UserError(
+            f"report: a folder lacks {typed.brief(str(error))}; give the folders that dipn-eval wrote"
+        ) from None
     return values, parts, figures
 
 
@@ -127,9 +135,9 @@ def _grasp_section(values: dict[str, Any]) -> str:
 
 def _load(path: pathlib.Path) -> Any:
     try:
-        return np.load(path)
-    except (OSError, ValueError):
-        raise UserError(f"{path}: missing or damaged; run the dipn-eval command that writes it again") from None
+        return arrays.read(path, _FILMS)
+    except typed.Misfit as error:
+        raise UserError(f"{path}: {error}; run the dipn-eval command that writes it again") from None
 
 
 def _prediction_film(films: Any) -> Any:
@@ -146,10 +154,7 @@ def _prediction_film(films: Any) -> Any:
 def _curves(runs: Sequence[pathlib.Path]) -> Any:
     figure, axes = plt.subplots(1, len(runs), figsize=(4 * len(runs), 3), squeeze=False)
     for axis, run in zip(axes[0], runs, strict=True):
-        try:
-            lines = [json.loads(line) for line in files.read_text(run / "metrics.jsonl").splitlines()]
-        except (OSError, ValueError):
-            raise UserError(f"{run}: no readable metrics.jsonl; give the --out of a dipn-train command") from None
+        lines = files.read_lines(run / "metrics.jsonl", wanted={str: float})
         for key in dict.fromkeys(k for line in lines for k in line if k != "step"):
             some = [line for line in lines if key in line]
             axis.plot(

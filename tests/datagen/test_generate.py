@@ -121,7 +121,7 @@ def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
         generate(JOB, copy)
     config = json.loads((copy / "config.json").read_text())
     (copy / "config.json").write_text(json.dumps(config | {"episodes": None}))
-    with pytest.raises(UserError, match="episodes None, want a whole number"):
+    with pytest.raises(UserError, match="episodes is null, want a whole number"):
         generate(JOB, copy)
 
 

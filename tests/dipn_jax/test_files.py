@@ -72,3 +72,20 @@ def test_a_file_that_is_no_utf8_is_damaged(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.json").write_bytes('{"name": "Tür"}'.encode("latin-1"))
     with pytest.raises(files.UserError, match="damaged, not JSON"):
         files.read_json(tmp_path / "a.json")
+
+
+def test_a_folder_that_was_begun_otherwise_is_said_in_one_line(tmp_path: pathlib.Path) -> None:
+    files.write_json(tmp_path / "config.json", {"kind": "a\nb" * 200})
+    with pytest.raises(files.UserError, match=r"begun with kind=a\?b.*, asked for kind=push") as caught:
+        files.claim(tmp_path, {"kind": "push"})
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize("text", ['{"a": 1}\n[', '{"a": 1}\n{"a": "x"}', '{"a": 1}\n\n{"a": 2}', '{"a": 1}\n3'])
+def test_a_line_of_a_log_that_does_not_fit_is_named(text: str, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"a": 1}\n{"a": 2.5}\n')
+    assert files.read_lines(path, wanted={"a": float}) == [{"a": 1}, {"a": 2.5}]
+    path.write_text(text)
+    with pytest.raises(files.UserError, match=r"metrics\.jsonl: damaged, line 2"):
+        files.read_lines(path, wanted={"a": float})

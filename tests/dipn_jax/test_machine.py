@@ -1,6 +1,7 @@
 """Facts about the machine and the sources."""
 
 import pathlib
+import platform
 import subprocess
 
 import pytest
@@ -66,3 +67,15 @@ def test_a_containers_quota_is_heeded(
     if group is not None:
         _written(tmp_path / "own" / "cgroup", group)
     assert machine.cores(groups=tmp_path / "groups", own=tmp_path / "own") == count
+
+
+def test_the_instruction_set_is_the_highest_level_that_the_processor_has(tmp_path: pathlib.Path) -> None:
+    info = tmp_path / "cpuinfo"
+    for flags, level in (
+        ("sse avx avx2 fma avx512f avx512bw avx512cd avx512dq avx512vl", "x86-64-v4"),
+        ("sse avx avx2 fma avx512f", "x86-64-v3"),
+        ("sse avx", platform.machine().replace("_", "-")),
+    ):
+        info.write_text(f"processor\t: 0\nmodel name\t: Some\nflags\t\t: {flags}\n\nprocessor\t: 1\n")
+        assert machine.instructions(info=info) == level
+    assert machine.instructions(info=tmp_path / "nowhere") == platform.machine().replace("_", "-")

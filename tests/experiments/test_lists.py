@@ -7,7 +7,7 @@ import pytest
 
 from experiments import clearing, demo, grasping, push_prediction, runs
 
-COUNTS = {demo: 11, push_prediction: 52, grasping: 31, clearing: 331}
+COUNTS = {demo: 11, push_prediction: 52, grasping: 31, clearing: 261}
 """Number of runs of each experiment."""
 
 each = pytest.mark.parametrize("experiment", COUNTS, ids=lambda module: module.__name__.rpartition(".")[2])
@@ -69,10 +69,10 @@ def test_the_recipes_that_figures_were_made_with() -> None:
         f"dipn-train grasp --batch 64 --data {data} --steps 2200 --learning-rate 1e-3 --init results/grasp/fourfold "
         "--out results/grasp/shipped"
     )
-    assert clear["table/random-30/paper/bare/dqn+gn/2"].line == (
-        "dipn-eval clear --cases random --objects 30 --instances 20 --label paper-bare-2 --aids --method dqn+gn "
+    assert clear["table/hard/paper/bare/dqn+gn/2"].line == (
+        "dipn-eval clear --cases hard --instances 10 --label paper-bare-2 --aids --method dqn+gn "
         "--value-net results/clear/paper/2/dqn --grasp-net results/clear/paper/2/gn "
-        "--out results/clear/table/random-30/paper/bare/dqn+gn/2"
+        "--out results/clear/table/hard/paper/bare/dqn+gn/2"
     )
     key = runs.keys(list(clear.values()))["grasp/pretrained"]
     assert key == runs.keys(list(grasp.values()))["pretrained"]

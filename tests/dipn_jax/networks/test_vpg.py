@@ -43,7 +43,17 @@ def test_pushes_have_sixteen_directions_and_grasps_eight() -> None:
     np.testing.assert_array_equal(grasp[8:], grasp[:8])
     assert np.abs(push[8:] - push[:8]).max() > 1e-3
     on_table = np.asarray(image)[0, ..., 3] == 0
-    assert (grasp[:, on_table] == 0).all() and (push[:, on_table] != 0).any(), "a push begins beside an object"
+    assert (push[:, on_table] != 0).any(), "a push begins beside an object"
+    assert np.isneginf(grasp[:, on_table]).all() and np.isfinite(grasp[:, ~on_table]).all(), "values may be negative"
+
+
+def test_a_chance_on_empty_table_is_zero() -> None:
+    model = checkpoint.build("vpg", VpgConfig(parts=("grasp",), answers="chance", width=8, coarse=8))
+    model.eval()
+    _, grasps = scorers.value_scorers(model)  # type: ignore[arg-type]
+    image = jnp.zeros((1, 224, 224, 4)).at[:, 90:130, 60:120, 3].set(0.05)
+    scores = np.asarray(grasps(image))[0]
+    assert (scores[:, np.asarray(image)[0, ..., 3] == 0] == 0).all() and scores.max() > 0
 
 
 def test_a_part_without_training_is_none_and_invalid_options_are_refused() -> None:

@@ -54,9 +54,9 @@ def test_every_object_in_sight_counts_by_what_its_best_grasp_lacks(row: Observat
     assert float(estimate(row, missed)) == pytest.approx(outlook.MISSES_PER_SHORTFALL * (short + more), rel=1e-5)
 
 
-def _decide(seen: Observation, predictor: Any, scorer: Any) -> Any:
-    rule, estimate = planner.Rule(grasp_above=0.7), outlook.misses_to_come(scorer)
-    return planner.decide(jax.random.key(0), seen, predictor, scorer, count=COUNT, rule=rule, estimate=estimate)
+def _decide(seen: Observation, predictor: Any, scorer: Any, missed: Any = planner.NONE_MISSED) -> Any:
+    rule, estimate, key = planner.Rule(grasp_above=0.7), outlook.misses_to_come(scorer), jax.random.key(0)
+    return planner.decide(key, seen, predictor, scorer, count=COUNT, rule=rule, missed=missed, estimate=estimate)
 
 
 def test_a_push_is_made_where_it_saves_more_than_itself(row: Observation) -> None:
@@ -66,6 +66,15 @@ def test_a_push_is_made_where_it_saves_more_than_itself(row: Observation) -> Non
     assert decision.value_push == pytest.approx(-1.0) and decision.is_push
     still = _decide(row, predictors.static_predictor, apart)
     assert still.value_push == pytest.approx(-1 - four, rel=1e-5) and not still.is_push, "it changes nothing"
+
+
+def test_a_miss_is_held_against_what_has_not_moved_only(row: Observation) -> None:
+    missed = np.array([[turn, 105, 85 + 13 * slot] for slot in range(4) for turn in (0, 3, 6)], np.int32)
+    decision, before = _decide(row, spread, apart, missed), _decide(row, spread, apart)
+    assert decision.value_now < before.value_now - 0.1
+    assert decision.value_push == pytest.approx(-1.0), "all four have moved away"
+    still = _decide(row, predictors.static_predictor, apart, missed)
+    assert still.value_push == pytest.approx(float(decision.value_now) - 1, rel=1e-5)
 
 
 def test_where_too_little_can_be_saved_no_push_is_considered(row: Observation) -> None:

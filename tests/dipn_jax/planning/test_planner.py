@@ -138,3 +138,37 @@ def test_the_action_of_the_higher_value_is_chosen(seen: Observation) -> None:
     assert not planner.decide_by_value(seen, valued(0.7), valued(0.5), grasp_above=0.4, distance=0.1).is_push
     assert not planner.decide_by_value(seen, valued(0.4), valued(0.5), distance=0.1).is_push
     assert decision.grasp_pixel.tolist() == [2, 112, 30]
+
+
+def test_a_grasp_is_chosen_by_one_value_and_compared_by_another(seen: Observation) -> None:
+    def valued(value: float, peak: float = 0.0) -> Any:
+        return lambda images: jnp.full((images.shape[0], 16, 224, 224), value).at[:, 2, 112, 30].add(peak)
+
+    def decide(push: float, **options: Any) -> Any:
+        return planner.decide_by_value(
+            seen, valued(push), valued(0.1, 0.2), plain=valued(0.5, 0.1), distance=0.1, **options
+        )
+
+    decision = decide(0.55)
+    assert not decision.is_push and decision.grasp_pixel.tolist() == [2, 112, 30]
+    np.testing.assert_allclose([decision.grasp_score, decision.value_now], [0.3, 0.6], rtol=1e-6)
+    assert decide(0.65).is_push
+    assert not decide(0.65, grasp_above=0.29).is_push and decide(0.65, grasp_above=0.31).is_push
+    missed = np.array([[2, 112, 30]] * 2, np.int32)
+    assert decide(0.55, missed=missed).grasp_pixel.tolist() != [2, 112, 30]
+
+
+def test_the_highest_of_nearly_equal_grasps_is_made(seen: Observation) -> None:
+    low, high = (2, 112, 30), (5, 40, 50)
+    seen = seen.replace(height=seen.height.at[high[1:]].set(0.095))
+
+    def scores(images: jax.Array) -> jax.Array:
+        table = jnp.full((images.shape[0], 16, 224, 224), 0.1)
+        return table.at[:, *low].set(0.9).at[:, *high].set(0.86)
+
+    for margin, pixel, score in ((0.0, low, 0.9), (0.03, low, 0.9), (0.05, high, 0.86)):
+        decision = _decide(seen, static, scores, top_margin=margin)
+        assert tuple(decision.grasp_pixel.tolist()) == pixel and not decision.is_push
+        np.testing.assert_allclose(decision.grasp_score, score, rtol=1e-6)
+        by_value = planner.decide_by_value(seen, scores, scores, distance=0.1, top_margin=margin)
+        assert tuple(by_value.grasp_pixel.tolist()) == pixel

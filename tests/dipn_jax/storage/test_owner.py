@@ -77,3 +77,10 @@ def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.P
     left = {p.name for p in (*tmp_path.iterdir(), *steps.iterdir())}
     alive = os.getppid()
     assert left == {"checkpoints", ".mine.tmp", f".00000003.{alive}.tmp", f".partial.npz.{alive}-0a1b2c3d.tmp"}
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[1]", "{", "\x00", '{"pid": "x"}'])
+def test_a_damaged_owner_file_names_nobody(text: str, tmp_path: pathlib.Path) -> None:
+    (tmp_path / "owner.json").write_text(text)
+    assert not owner._dead(tmp_path / "owner.json")
+    assert "\n" not in str(owner._taken(tmp_path / "owner.json"))

@@ -126,6 +126,38 @@ def test_a_manifest_without_some_of_its_keys_is_damaged(copy: pathlib.Path, gone
             look(copy)
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("bytes", "9"),
+        ("sha256", 1),
+        ("episodes", 0),
+        ("episodes", 1.5),
+        ("faults", [1]),
+        ("faults", {"a": "b"}),
+        ("kind", 3),
+    ],
+)
+def test_a_manifest_with_entries_of_other_types_is_damaged(copy: pathlib.Path, key: str, value: object) -> None:
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["shards"]["shard-00001.parquet"][key] = value
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    for look in (records.verify, records.summary, records.update_manifest):
+        with pytest.raises(UserError, match=r"manifest\.json is damaged; run dipn-datagen repair") as caught:
+            look(copy)
+        assert "\n" not in str(caught.value)
+    assert records.repair(copy) == [] and records.verify(copy) == []
+
+
+def test_a_manifest_that_counts_other_episodes_is_wrong(copy: pathlib.Path) -> None:
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["shards"]["shard-00001.parquet"]["episodes"] = 7
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    ((path, what),) = records.verify(copy)
+    assert path.name == "shard-00001.parquet" and what == "8 push episodes, want 7 push"
+    assert records.repair(copy) == [] and records.verify(copy) == []
+
+
 def test_where_files_cannot_be_locked_the_manifest_is_written_all_the_same(tmp_path: pathlib.Path) -> None:
     script = (
         "import pathlib, sys; sys.modules['fcntl'] = None\n"  # as where there is no such module

@@ -67,7 +67,11 @@ def _file(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
         ({"quaternion_wxyz": [0, 0, 0, 0]}, "out of range"),
         ({"position_m": "left"}, "position_m"),
         ({"height_m": "x"}, "height_m|could not convert"),
-        ({"height_m": float("nan")}, "height_m"),
+        ({"height_m": float("nan")}, "NaN is not a finite number"),
+        ({"position_m": [1e300, 0]}, "number above 1e"),
+        ({"position_m": [10**400, 0]}, "position_m"),
+        ({"size_mm": ["50", "50", "50"]}, r"size_mm\[0\] is 50, want a finite number"),
+        ({"shape": ["cuboid"]}, "unknown shape 'a list of 1'"),
         ({"color_rgb": [-9999, 0, 0]}, "color_rgb"),
     ],
 )

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from dipn_jax.eval.clearing import instances, lockstep
 
-from dipn_jax import geometry
 from dipn_jax.structs import ABSENT, Scene
 from dipn_jax.workspace import WORKSPACE
 
@@ -61,42 +60,3 @@ def test_a_table_is_cleared_before_its_actions_count() -> None:
         assert lockstep._ended(_table([ABSENT, ABSENT], here, actions=actions)) == "cleared"
     wanted = {0: "", 5: "", 6: "out of actions", 7: "out of actions"}
     assert {n: lockstep._ended(_table([0, ABSENT], here, actions=n)) for n in wanted} == wanted
-
-
-MISS = np.array([3, 150, 90], np.int32)
-"""A grasp: direction, row, column."""
-AT = np.asarray(geometry.pixels_to_metres(np.array([90.0, 150.0])))
-"""Its centre in metres."""
-
-
-def _remembered(
-    before: list[int], after: list[int], shift: tuple[float, ...], *, did: str = "push", away: float = 0.0
-) -> int:
-    """Return whether the miss is remembered once the second object, `away` from it along y, has moved by `shift`."""
-    start = [(-0.2, -0.2, 0.02), (AT[0], AT[1] + away, 0.02)]
-    table = _table(after, [start[0], tuple(np.add(start[1], shift))])
-    table.did, table.missed = ["grasp missed", did], (MISS,)
-    lockstep._update_missed(table, (np.array(before), _table(before, start).poses), np.zeros(3, np.int32))
-    return len(table.missed)
-
-
-def test_a_miss_is_forgotten_when_an_object_near_it_moves_or_is_gone() -> None:
-    assert _remembered([0, 0], [0, 0], (0, 0, 0)) == 1
-    assert _remembered([0, 0], [0, 0], (0.0049, 0, 0)) == 1 and _remembered([0, 0], [0, 0], (0.0051, 0, 0)) == 0
-    assert _remembered([0, 0], [0, 0], (0, -0.0049, 0)) == 1 and _remembered([0, 0], [0, 0], (0, -0.0051, 0)) == 0
-    assert _remembered([0, 0], [0, 0], (0.004, 0.004, 0)) == 0, "by the straight distance"
-    assert _remembered([0, 0], [0, 0], (0, 0, 0.1)) == 1, "up is not away"
-    assert _remembered([0, 0], [0, ABSENT], (0, 0, 0)) == 0
-    assert _remembered([0, ABSENT], [0, ABSENT], (0.1, 0, 0)) == 1, "it had gone before"
-    assert _remembered([0, 0], [0, 0], (0.01, 0, 0), away=0.0599) == 0
-    assert _remembered([0, 0], [0, 0], (0.01, 0, 0), away=0.0601) == 1
-    assert _remembered([0, 0], [0, 0], (0, 0, 0), did="grasp missed") == 2
-
-
-def test_the_latest_eight_misses_are_remembered() -> None:
-    table = _table([0, 0], [(-0.2, -0.2, 0), (0.2, 0.2, 0)])
-    table.did = ["grasp missed"]
-    for number in range(1, 11):
-        lockstep._update_missed(table, (table.scene.shape, table.poses.copy()), np.array([number, 112, 112]))
-        assert [each[0] for each in table.missed] == list(range(max(1, number - 7), number + 1))
-        assert lockstep._missed(table).shape == (8, 3)

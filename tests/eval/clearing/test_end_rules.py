@@ -13,7 +13,7 @@ from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax import files
 from dipn_jax.planning import planner
 from dipn_jax.storage.resume import Partial
-from dipn_jax.structs import ABSENT, Decision, Fault, Grasp, Push, Scene
+from dipn_jax.structs import ABSENT, Decision, Fault, Grasp, Observation, Push, Scene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import scenes
 
@@ -28,8 +28,11 @@ class Script:
     done: int = 0
     longest: float = 0.0
 
-    def decide(self, keys: jax.Array, scene: Scene, poses: np.ndarray, missed: np.ndarray) -> Any:
+    def decide(self, keys: jax.Array, scene: Scene, poses: np.ndarray, recall: Any) -> Any:
         """Push or grasp as the script says."""
+        empty, label = np.zeros((1, 224, 224, 3), np.float32), np.full((1, 224, 224), -1, np.int32)
+        seen = Observation(empty[..., 0], empty, label, slots=OBJECTS)
+        recall(seen.height)
         zero = np.zeros(1, np.float32)
         decision = Decision(
             is_push=np.array([self.steps[self.done][0] == "push"]),
@@ -41,7 +44,7 @@ class Script:
             value_push=zero,
             motion=np.zeros((1, OBJECTS, 3), np.float32),
         )
-        return decision, np.full((1, 224, 224), -1, np.int8)
+        return decision, seen
 
     def push(self, engine: Any, scene: Scene, poses: np.ndarray, push: Push, *, longest: float) -> Any:
         """Move the first object to where the script says, or fail."""

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dipn_jax.eval.clearing import instances, lockstep, on_tables
+from dipn_jax.eval.clearing.camera import Camera
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.grasping import success
 
 from dipn_jax import geometry, structs
 from dipn_jax.planning import planner, scorers
 from dipn_jax.storage.resume import Partial
-from dipn_jax.structs import ABSENT, Array, Fault, Grasp, Rollout, Scene, SettledScene, Trajectory
+from dipn_jax.structs import ABSENT, Array, Fault, Grasp, Observation, Rollout, Scene, SettledScene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import clutter, scenes
 
@@ -61,7 +62,8 @@ def _table(did: list[str], place: str, *, friction: float = 0.5, mass: float = 0
     scene = Scene(np.full(1, ABSENT, np.int32), size, color, mass * one, friction * one)
     center = geometry.pixels_to_metres(jnp.array(PEAKS[place][::-1]))
     poses = np.array([[*center, 0.02, 1, 0, 0, 0]], np.float32)
-    known = {"shape": np.zeros(1, np.int32), "poses": poses, "missed": planner.NONE_MISSED}
+    grasp = np.array([0, *PEAKS["first"]], np.int32)
+    known = {"shape": np.zeros(1, np.int32), "poses": poses, "missed": planner.NONE_MISSED, "grasp": grasp}
     film = [known | {"values": np.array([0.9, 0, 0])} for _ in did]
     return Instance("x", scene, poses + 1, 1, did=did, film=film)
 
@@ -92,6 +94,13 @@ def test_other_grasps_are_ranked_with_the_misses_that_the_policy_knew() -> None:
     assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 1  # type: ignore[arg-type]
 
 
+def test_the_grasp_that_missed_is_left_out_whatever_its_rank() -> None:
+    table = _table(["grasp missed"], "first")
+    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 0  # type: ignore[arg-type]
+    table.film[0]["grasp"] = np.array([0, *PEAKS["second"]], np.int32)
+    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 1  # type: ignore[arg-type]
+
+
 def test_without_a_miss_there_is_no_ceiling() -> None:
     found = success._other_grasps(peaks, Lifts(), [_table(["grasp held"], "second")], 3)  # type: ignore[arg-type]
     assert found == {"other_grasps/missed": 0, "other_grasps/tried_each": 3}
@@ -101,7 +110,16 @@ def test_a_random_grasp_that_went_wrong_does_not_count() -> None:
     tables = [_table([], "first", mass=mass, friction=f) for mass, f in ((0.1, 0.5), (HEAVY, 0.5), (HEAVY, FAULTY))]
     for table in tables:
         table.scene, table.poses = table.scene.replace(shape=np.zeros(1, np.int32)), table.poses - 1
-    found = success._random_foreground(peaks, Lifts(reach=1), tables, 0)  # type: ignore[arg-type]
+    seen = []
+
+    class Noisy(Camera):
+        def look(self, *args: Any) -> Observation:
+            seen.append(super().look(*args))
+            return seen[-1]
+
+    camera = Noisy(height_noise=0.001)
+    found = success._random_foreground(peaks, Lifts(reach=1), tables, 0, camera)  # type: ignore[arg-type]
+    assert np.std(seen[0].height[:, :40, 200:]) == pytest.approx(0.001, rel=0.1), "what the camera sees is grasped"
     assert found["grasp_success/random_foreground"] == pytest.approx(1 / 2)
     assert found["random/reliability/0/count"] == 2 and found["random/expected_calibration_error"] == pytest.approx(0.5)
 

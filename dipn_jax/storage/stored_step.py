@@ -1,0 +1,93 @@
+"""What is read of a checkpoint's step: its metadata, a network's config from there, and stored arrays."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import orbax.checkpoint as ocp
+
+from dipn_jax import typed
+from dipn_jax.errors import UserError
+
+FORM = {
+    "format_version": int,
+    "network": str,
+    "network_config": dict,
+    "step": typed.Whole(),
+    "sha256": {str: str},
+    "versions?": dict,
+}
+"""Form of `meta.json`."""
+LARGEST = 65_536
+"""Largest number in a network's config."""
+
+
+def config(cls: type, values: dict[str, Any]) -> Any:
+    """Return a network's config dataclass, from its values in `meta.json`.
+
+    Raises:
+      TypeError: they do not fit it.
+    """
+    form = {f"{field.name}?": _form(field.default) for field in dataclasses.fields(cls)}
+    unknown = sorted(set(values) - {field.name for field in dataclasses.fields(cls)})
+    if unknown:
+        raise TypeError(f"no option {typed.brief(unknown[0])}")
+    try:
+        typed.check(values, form)
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    except (typed.Misfit, UserError) as error:
+        raise TypeError(str(error)) from None
+
+
+def _form(default: Any) -> typed.Form:
+    """Return the form of an option whose default is this."""
+    if isinstance(default, tuple):
+        return [_form(default[0])]
+    return typed.Whole(1, LARGEST) if type(default) is int else type(default)
+
+
+def require_room(part: pathlib.Path, config: Any) -> None:
+    """Raise a UserError where a config is of a larger network than the stored arrays, before memory is taken for it.
+
+    Args:
+      part: folder of the network's arrays.
+      config: its config; no number in it is above the number of arrays, or the largest of their sizes.
+    """
+    shapes = [one.shape for one in _stored(part).values()]
+    largest = max([len(shapes), *(size for shape in shapes for size in shape)])
+    for value in dataclasses.astuple(config):
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, int) and number > largest:
+                raise UserError(f"checkpoint {part}: its config is of a larger network than its arrays; train again")
+
+
+def arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
+    """Return the arrays of one Orbax folder by their path in the tree, whatever devices saved them.
+
+    Raises:
+      UserError: they cannot be read.
+    """
+    as_numpy = {key: ocp.RestoreArgs(restore_type=np.ndarray) for key in _stored(part)}
+    with _reading(part):
+        restored: dict[str, np.ndarray] = ocp.PyTreeCheckpointer().restore(part, restore_args=as_numpy)
+        return restored
+
+
+def _stored(part: pathlib.Path) -> dict[str, Any]:
+    """Return what Orbax says of the arrays of a folder, by their path in the tree."""
+    with _reading(part):
+        return dict(ocp.PyTreeCheckpointer().metadata(part).item_metadata.tree)
+
+
+@contextlib.contextmanager
+def _reading(part: pathlib.Path) -> Iterator[None]:
+    """Turn what goes wrong into one line: what is missing or damaged, Orbax and TensorStore say in many ways."""
+    try:
+        yield
+    except Exception as error:
+        raise UserError(f"checkpoint {part}: cannot be read ({type(error).__name__}); train again") from None
