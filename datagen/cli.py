@@ -1,4 +1,4 @@
-"""The program `dipn-datagen`: push, grasp, images, check-world, verify, repair, info."""
+"""The program `dipn-datagen`: push, grasp, images, replay, check-world, verify, repair, info."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
 from . import upkeep
+from .check_command import check_world
+from .replay_command import replay
 
 if TYPE_CHECKING:
     from dipn_jax.planning.planner import Scorer
@@ -215,38 +217,11 @@ def images(
     _generate(job, out, work, given)
 
 
-def check_world(
-    out: pathlib.Path,
-    engines: tuple[str, ...] = ("native_awake", "native_1ms", "native_3.3ms", "native_5ms", "mjx"),
-    scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 32,
-    few: int = 8,
-    tries: int = 100,
-    seed: int = 0,
-    threads: int | None = None,
-) -> None:
-    """Measure whether the simulated world is right: drops, grasps, pushes, the camera, and how far the engines agree.
-
-    About ten minutes on two cores; the results of the last run are in docs/world.md:
-      dipn-datagen check-world --out results/world
-
-    Args:
-      out: folder for metrics.json and world.md; the same command continues where it stopped.
-      engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
-      scenes_: scenes with a push and a grasp each.
-      few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
-      tries: grasps of every catalogue item.
-      seed: random seed of everything.
-      threads: that native simulates on; one a core if not given.
-    """
-    from . import check
-
-    check.run(out, check.CheckConfig(engines, scenes=scenes_, few=few, tries=tries, seed=seed), threads=threads)
-
-
 COMMANDS: dict[str, Callable[..., Any]] = {
     "push": push,
     "grasp": grasp,
     "images": images,
+    "replay": replay,
     "check-world": check_world,
     "verify": upkeep.verify,
     "repair": upkeep.repair,

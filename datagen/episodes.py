@@ -14,6 +14,7 @@ from dipn_jax.engine import Engine
 from dipn_jax.planning import candidates
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import render
+from dipn_jax.storage import codec
 from dipn_jax.structs import (
     Array,
     Fault,
@@ -59,8 +60,10 @@ def push_batch(
     repeated = structs.take(items, np.repeat(np.arange(n), actions)[keep].repeat(len(distances)))
     each = np.tile(np.asarray(distances, np.float32), int(keep.sum()))
     pushes = structs.take(pushes, np.arange(int(keep.sum())).repeat(len(distances))).replace(distance=each)
+    repeated, pushes = codec.rounded(repeated), codec.rounded(pushes, prefix="push.")  # so that it can be replayed
     rollout = primitives.push(engine, repeated.scene, repeated.poses, pushes)
-    poses = np.asarray(rollout.poses)
+    poses = np.array(rollout.poses)
+    poses[:, 0] = repeated.poses  # where the simulation began; as the gripper arrives, they are a few micrometres off
     episodes = PushEpisode(repeated.scene, poses[:, : PUSH_STEPS + 1], poses[:, -1], pushes, np.asarray(rollout.fault))
     return _drop_unusable(episodes, counts, together=len(distances))
 
@@ -109,7 +112,8 @@ def grasp_batch(
         return Batch(None, counts)
     grasps = aim_grasps(jax.random.split(aim, n), items.scene, items.poses, actions=actions, guide=guide)
     grasps = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), grasps)
-    repeated = structs.take(items, np.repeat(np.arange(n), actions))
+    repeated = codec.rounded(structs.take(items, np.repeat(np.arange(n), actions)))  # so that it can be replayed
+    grasps = codec.rounded(grasps, prefix="grasp.")
     rollout, outcome = primitives.grasp(engine, repeated.scene, repeated.poses, grasps)
     episodes = GraspEpisode(
         scene=repeated.scene,

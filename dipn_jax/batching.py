@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dipn_jax import forking
+
 BATCH = 64
 """Rows that a compiled function takes at a time."""
 SMALL_BATCH = 16
@@ -27,6 +29,7 @@ def in_batches(function: Callable[..., Any], *args: Any) -> Any:
     Returns:
       What `function` returns, its rows joined.
     """
+    forking.check()
     count = len(jax.tree.leaves(args)[0])
     parts, start = [], 0
     while start < count:
@@ -47,6 +50,7 @@ def in_small_batches(function: Callable[..., Any], *args: Any) -> Any:
       function: jitted, of pytrees with a leading axis, and of `real [SMALL_BATCH]` bool.
       args: pytrees with a leading axis.
     """
+    forking.check()
     count = len(jax.tree.leaves(args)[0])
     parts = []
     for start in range(0, count, SMALL_BATCH):

@@ -261,8 +261,11 @@ def _missing_device() -> str | None:
     return None
 
 
-def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> None:
-    """Call the command that `arguments` name; its own help is complete, the list of all gives a sentence each."""
+def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> int | None:
+    """Call the command that `arguments` name and return what it returns.
+
+    Its own help is complete; the list of all gives a sentence each.
+    """
     choices = tuple(
         Annotated[
             Any,
@@ -274,4 +277,6 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
     )
     one_of_them: Any = Union[choices]  # noqa: UP007  a tuple
     program = pathlib.Path(sys.argv[0]).name
-    tyro.cli(one_of_them, prog=program, description=description, args=arguments, config=(tyro.conf.OmitArgPrefixes,))
+    options = (tyro.conf.OmitArgPrefixes,)
+    code: int | None = tyro.cli(one_of_them, prog=program, description=description, args=arguments, config=options)
+    return code

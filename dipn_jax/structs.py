@@ -172,7 +172,9 @@ class PushEpisode(Pytree):
     """One push, with everything needed to render it before, during and after."""
 
     scene: Scene
-    poses: Float[Array, "*b 11 N 7"]  # at 0, 1, ..., 10 cm of travel (every 0.1 s, also after `push.distance`)
+    poses: Float[
+        Array, "*b 11 N 7"
+    ]  # before, then at 1, ..., 10 cm of travel (every 0.1 s, also after `push.distance`)
     after: Float[Array, "*b N 7"]  # at rest, the gripper gone
     push: Push
     fault: Int[Array, "*b"]  # bits of Fault

@@ -6,6 +6,8 @@ import pathlib
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 from dipn_jax.datagen import cli as datagen_cli
@@ -187,7 +189,21 @@ def test_every_command_that_simulates_takes_threads(call, tmp_path: pathlib.Path
     assert options.settings({"seed": 1, "threads": 3}) == {"seed": 1}
 
 
-@pytest.mark.parametrize("platform", ["cuda", "bananas"])
+def test_commands_without_threads_are_those_that_simulate_nothing() -> None:
+    def takes(command: Callable[..., Any]) -> bool:
+        given = inspect.signature(command).parameters
+        work = getattr(given.get("work"), "default", None)
+        return "threads" in given or hasattr(work, "threads")
+
+    without = {stage: {name for name, one in known.items() if not takes(one)} for stage, known in COMMANDS.items()}
+    assert without == {
+        "datagen": {"verify", "repair", "info"},
+        "train": {"push", "grasp-pretrain", "grasp", "export"},
+        "eval": {"report"},
+    }
+
+
+@pytest.mark.parametrize("platform", ["cuda", "tpu", "bananas"])
 def test_a_device_that_is_not_there_is_one_line(platform: str, tmp_path: pathlib.Path) -> None:
     """Each command comes to JAX in its own way: its default device, a seed, a network."""
     scripts = [["datagen", "images"], ["train", "grasp-online"], ["eval", "grasp", "--grasp-net", "builtin"]]

@@ -10,12 +10,14 @@ import shlex
 import shutil
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import tyro
 from dipn_jax.eval.report import paper
 
 from benchmarks.__main__ import BENCHMARKS
 from dipn_jax import console, files
+from dipn_jax.sight import render
 from experiments import moving_picture, runs, tutorial_pictures
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -35,11 +37,12 @@ ALWAYS = {
     "dipn-eval": [],
 }
 """Options that a test adds to those commands where they make or learn something."""
-MAINTENANCE = ("info", "verify", "repair", "export")
+MAINTENANCE = ("info", "verify", "repair", "export", "replay")
 """Commands that make and learn nothing, and take none of those options."""
 RUN = {
     "many_workers.md": ("push", *MAINTENANCE),
     "your_network.md": ("push", "images", "export"),
+    "weights_elsewhere.md": ("export",),
     "sweep_distance.md": ("push",),
     "your_cases.md": ("push", "grasp"),
     "engines.md": ("push",),
@@ -160,8 +163,12 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
         assert not names["rollout"].fault.any()
     elif page.name == "your_cases.md":
         assert names["names"] == ["two-cubes"] and names["observation"].slots == 2
+    elif page.name == "weights_elsewhere.md":
+        assert names["kernel"].shape == (3, 3, 64, 24) and names["about"]["network"] == "grasp"
     elif page.name == "many_workers.md":
         assert names["episodes"].poses.shape[:2] == (24, 11)
+        wanted = render.render(names["pushes"].scene[3], names["pushes"].poses[3, 0])
+        np.testing.assert_array_equal(names["seen"][3].height, wanted.height)
 
 
 @pytest.mark.slow
@@ -220,7 +227,7 @@ def test_commands_of_howtos_work_at_small_scale(tmp_path: pathlib.Path, monkeypa
     for name, wanted in RUN.items():
         done = set()
         for words in commands(ROOT / "docs" / "howto" / name):
-            if words[1] not in wanted or {"paper", "found", "mjx"} & set(words):
+            if words[1] not in wanted or {"paper", "found", "mjx", "vpg"} & set(words):
                 continue
             program, *arguments = smaller(words)
             known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
@@ -228,4 +235,4 @@ def test_commands_of_howtos_work_at_small_scale(tmp_path: pathlib.Path, monkeypa
             done.add(words[1])
         assert done == set(wanted) & {words[1] for words in commands(ROOT / "docs" / "howto" / name)}, name
     assert files.read_json(pathlib.Path("data/sweep/config.json"))["distances"] == [0.03, 0.06, 0.1]
-    assert any(pathlib.Path("exported/dipn").iterdir())
+    assert any(pathlib.Path("exported/dipn").iterdir()) and pathlib.Path("exported/gn.safetensors").is_file()

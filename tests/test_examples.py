@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flax import nnx
+
+import dipn_jax
 
 EXAMPLES = pathlib.Path(__file__).parent.parent / "examples"
 
@@ -16,9 +19,9 @@ def run(name: str) -> dict[str, Any]:
     return runpy.run_path(str(path))
 
 
-def test_there_are_six_of_at_most_forty_lines() -> None:
+def test_there_are_seven_of_at_most_forty_lines() -> None:
     paths = sorted(EXAMPLES.glob("*.py"))
-    assert [path.name[:3] for path in paths] == ["01_", "02_", "03_", "04_", "05_", "06_"]
+    assert [path.name[:3] for path in paths] == ["01_", "02_", "03_", "04_", "05_", "06_", "07_"]
     assert all(len(path.read_text().splitlines()) <= 40 for path in paths)
 
 
@@ -57,3 +60,12 @@ def test_05_longer_pushes_move_objects_further() -> None:
 def test_06_clears_the_table() -> None:
     found = run("06")
     assert (found["scene"].shape < 0).all() and found["actions"].count("grasp") == 4
+
+
+def test_07_scores_as_the_network_does_in_jax() -> None:
+    found = run("07")
+    assert "jax" not in (EXAMPLES / "07_weights_without_jax.py").read_text().split("with safe_open")[1]
+    network = dipn_jax.load_network(network="grasp")
+    np.testing.assert_allclose(found["scores"], nnx.sigmoid(network(found["image"][None]))[0], atol=1e-4)
+    row, col = np.unravel_index(found["scores"].argmax(), found["scores"].shape)
+    assert 140 <= row < 180 and 180 <= col < 195, "it grasps the block"

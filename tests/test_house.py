@@ -27,8 +27,8 @@ MOST_LINES = 300
 """Largest number of lines in a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "names", "seeds", "typed", "interruption", "files", "console", "machine", "structs", "workspace",
-    "geometry", "batching", "engine", "world", "physics", "sight", "networks", "storage", "planning",
+    "errors", "names", "seeds", "typed", "interruption", "forking", "files", "console", "machine", "structs",
+    "workspace", "geometry", "batching", "engine", "world", "physics", "sight", "networks", "storage", "planning",
 ]  # fmt: skip
 
 

@@ -91,6 +91,7 @@ def learn(
     config: BaselineConfig,
     out: pathlib.Path,
     *,
+    initial: VPG | None = None,
     scorer: Scorer | None = None,
     scored_by: str = "",
 ) -> dict[str, float]:
@@ -101,6 +102,7 @@ def learn(
       scenes: distribution of fresh tables.
       config: how to learn.
       out: run folder: `config.json`, `metrics.jsonl` (one line a round), `checkpoints/`.
+      initial: network to start from, whose architecture is used.
       scorer: GN, whose grasps `dqn` executes.
       scored_by: digest of its weights.
 
@@ -108,15 +110,18 @@ def learn(
       Mean reward of all and of the last pushes and grasps.
 
     Raises:
-      UserError: the folder holds another run, there is no scorer for `dqn`, or a loss is not finite.
+      UserError: the folder holds another run, there is no scorer for `dqn`, `initial` is of another method, or a loss
+        is not finite.
     """
     if (config.method == "dqn") != (scorer is not None):
         raise UserError(
             f"baseline: --method {config.method} takes {'a' if config.method == 'dqn' else 'no'} --grasp-net"
         )
-    network = VpgConfig(config.preset, LEARNT_PARTS[config.method], "chance" if config.method == "rea" else "value")
-    model: Any = checkpoint.build("vpg", network, seed=config.seed)
-    with Run(out, _identity(engine, scenes, config, scored_by)) as run:
+    if initial is not None:
+        config = dataclasses.replace(config, preset=initial.config.preset)  # type: ignore[arg-type]
+    model: Any = _begun(config, initial)
+    network = model.config
+    with Run(out, _identity(engine, scenes, config, scored_by, initial)) as run:
         ended = run.ended()
         if ended:
             return {name: value for name, value in ended.items() if name.startswith("reward/")}
@@ -128,6 +133,20 @@ def learn(
         extra = {"seed": config.seed, "method": config.method, "examples": len(state.did), **result}
         run.finish(model, len(state.did), network="vpg", config=network, extra=extra)
         return result
+
+
+def _begun(config: BaselineConfig, initial: VPG | None) -> VPG:
+    """Return the network to begin with: `initial`, which has to be of the method, or one with random weights."""
+    fresh = VpgConfig(config.preset, LEARNT_PARTS[config.method], "chance" if config.method == "rea" else "value")
+    if initial is None:
+        return checkpoint.build("vpg", fresh, seed=config.seed)  # type: ignore[return-value]
+    wanted, given = ((one.parts, one.answers) for one in (fresh, initial.config))
+    if given != wanted:
+        there, here = (f"{answers}s of {' and '.join(parts)}" for parts, answers in (given, wanted))
+        raise UserError(
+            f"--init: holds {there}, want {here} for --method {config.method}; give a run of that method, or none"
+        )
+    return nnx.clone(initial)
 
 
 def _play(
@@ -155,9 +174,12 @@ def _play(
     return run.play(fresh, act, total=total, what=f"act and learn {config.method}", trees=trees, log=log)
 
 
-def _identity(engine: Engine, scenes: SceneConfig, config: BaselineConfig, scored_by: str) -> dict[str, Any]:
+def _identity(
+    engine: Engine, scenes: SceneConfig, config: BaselineConfig, scored_by: str, initial: VPG | None
+) -> dict[str, Any]:
     """Return everything that determines the run; runs without GN do not name one."""
     identity = {**dataclasses.asdict(config), "scenes": str(scenes), "engine": type(engine).__name__}
+    identity["initial_weights"] = None if initial is None else checkpoint.digest(initial)
     return identity | ({"grasp_net": scored_by} if scored_by else {})
 
 

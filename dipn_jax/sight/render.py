@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from dipn_jax import batching, geometry
+from dipn_jax import batching, forking, geometry
 from dipn_jax.structs import ABSENT, Array, Observation, Scene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
@@ -108,6 +108,7 @@ def render_depth(
     return jax.lax.fori_loop(0, n, paint, start)
 
 
+@forking.guarded
 @functools.partial(jax.jit, static_argnames=("pixels",))
 def render(scene: Scene, poses: Float[Array, "N 7"], *, pixels: int = WORKSPACE.pixels) -> Observation:
     """Render what the camera sees of one scene; arguments as `render_depth`.

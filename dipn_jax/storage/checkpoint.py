@@ -23,7 +23,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import console, files, typed
+from dipn_jax import console, files, forking, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
 from dipn_jax.storage import stored_step
@@ -270,6 +270,7 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     Raises:
       UserError: no run there, no whole step in it, or it holds another network.
     """
+    forking.check()
     run = find(pathlib.Path(run), network=network)
     if not run.is_dir():
         raise UserError(f"checkpoint {run}: no such folder; {WANTED}")

@@ -7,12 +7,14 @@ before: most objects do not move, and zeros take no room. A decoded value is wit
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from dipn_jax import structs
+
+T = TypeVar("T")
 
 QUANTA = {
     "poses": 1e-6,  # metres, and components of quaternions
@@ -99,3 +101,16 @@ def decode(stored: Columns, specs: dict[str, dict[str, Any]]) -> Columns:
     for name, spec in specs.items():
         columns[name] = (columns[name] * spec["quantum"]).astype(np.float32)
     return columns
+
+
+def rounded(struct: T, *, prefix: str = "") -> T:
+    """Return a batch as a shard gives it back: every value is the multiple of its quantum that would be stored.
+
+    What is simulated from rounded values can be simulated again from what is stored, bit for bit.
+
+    Args:
+      struct: a batch of scenes, poses or actions, NumPy or JAX.
+      prefix: before the names of its columns, such as `push.` for a `Push`.
+    """
+    named = {prefix + name: value for name, value in columns(struct).items()}
+    return assemble(type(struct), decode(*encode(named)), prefix=prefix)

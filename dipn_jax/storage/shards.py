@@ -28,6 +28,11 @@ SCHEMA_VERSION = 2
 """Version of the format; shards of another version are refused."""
 COMPRESSION_LEVEL = 9
 """Level of zstd; it takes a few milliseconds a shard, because bytes of the same place of all numbers are neighbours."""
+ROUNDED_START = "rounded"
+"""Entry `start` of the metadata: episodes were simulated from what is stored, so they can be simulated again exactly.
+
+Shards without it are older: their episodes began within half a quantum of what is stored, and contact amplifies that.
+"""
 _META_KEY = b"dipn_jax"
 """Key of our entry in the metadata of a shard."""
 
@@ -76,6 +81,7 @@ def write_shard(
         "columns": specs,
         "config": config,
         "faults": faults,
+        "start": ROUNDED_START,
         "versions": files.package_versions(),
         "processor": machine.processor(),
         "instructions": machine.instructions(),

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Key
 
-from dipn_jax import batching, structs
+from dipn_jax import batching, forking, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.structs import Array, Fault, Grasp, Scene, SettledScene
@@ -32,6 +32,7 @@ def settled(
     Returns:
       The scenes kept `[K]`, and how many were dropped and why others were not kept.
     """
+    forking.check()
     draw = functools.partial(_random_scenes, config=config)
     scene, poses = jax.tree.map(np.asarray, batching.in_batches(draw, jax.random.split(key, count)))
     rollout = primitives.settle(engine, scene, poses, fence=primitives.FENCE_TIME)

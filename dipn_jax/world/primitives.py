@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dipn_jax import geometry
+from dipn_jax import forking, geometry
 from dipn_jax.engine import Engine
 from dipn_jax.structs import Array, Fault, Grasp, Outcome, Push, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS
@@ -111,6 +111,7 @@ def settle(
     engine: Engine, scenes: Scene, poses: Float[Array, "B N 7"], *, duration: float = SETTLE_TIME, fence: float = 0.0
 ) -> Rollout:
     """Let the scenes come to rest; one sample, at the end. For `fence` see `Engine.simulate`."""
+    forking.check()
     batch = len(np.asarray(scenes.shape))
     still, end = parked_trajectory(batch, duration), np.array([duration])
     return engine.simulate(scenes, poses, still, end, settle=True, fence=fence)
@@ -125,6 +126,7 @@ def push(
     longest: float = PUSH_STEPS * 0.01,
 ) -> Rollout:
     """Execute one push of at most `longest` metres per scene; 12 samples: at each centimetre, and at rest."""
+    forking.check()
     rollout = engine.simulate(scenes, poses, push_trajectory(pushes), push_samples(longest=longest), settle=True)
     over = tipped(rollout.poses[..., 0, :, 3:], rollout.poses[..., -1, :, 3:]) & (scenes.shape >= 0)
     return rollout.replace(fault=rollout.fault | jnp.where(over.any(-1), Fault.TIPPED, 0))
@@ -138,6 +140,7 @@ def tipped(before: Float[Array, "*b 4"], after: Float[Array, "*b 4"]) -> Bool[ja
 
 def grasp(engine: Engine, scenes: Scene, poses: Float[Array, "B N 7"], grasps: Grasp) -> tuple[Rollout, Outcome]:
     """Execute one grasp per scene; two samples: before, and after the lift."""
+    forking.check()
     rollout = engine.simulate(scenes, poses, grasp_trajectory(grasps), grasp_samples())
     return rollout, grasp_outcome(scenes, rollout)
 

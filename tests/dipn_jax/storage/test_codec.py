@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from dipn_jax import structs
 from dipn_jax.storage import codec
 
 
@@ -55,3 +56,16 @@ def test_values_that_are_not_finite_are_refused(rng: np.random.Generator) -> Non
     columns["poses"][0, 0, 0, 0] = np.nan
     with pytest.raises(ValueError, match="poses: not finite"):
         codec.encode(columns)
+
+
+def test_what_is_rounded_is_stored_and_read_without_a_loss(rng: np.random.Generator) -> None:
+    """Fields of a struct by itself have the quanta that they have within an episode."""
+    angle = rng.uniform(0, 6, 5).astype(np.float32)
+    push = structs.Push(rng.uniform(-0.2, 0.2, (5, 2)).astype(np.float32), angle, np.full(5, 0.1, np.float32))
+    rounded = codec.rounded(push, prefix="push.")
+    assert (rounded.angle != angle).any() and np.abs(rounded.angle - angle).max() < 1e-6
+    stored = {f"push.{name}": value for name, value in codec.columns(rounded).items()}
+    again = codec.decode(*codec.encode(stored))
+    for name, value in stored.items():
+        np.testing.assert_array_equal(again[name], value)
+    np.testing.assert_array_equal(codec.rounded(push).angle, angle, "without the prefix it is an unknown column")
