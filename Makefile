@@ -2,16 +2,16 @@
 # make test   lint, types, tests
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
 # make mutants  the table of docs/testing.md (hours)
-# make push-figures, make grasp-figures, make clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
+# make fuzz, make faults  the counts of docs/reliability.md (hours)
+# make push-figures, grasp-figures, clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
 PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
-.PHONY: setup demo test lint bench mutants push-figures grasp-figures clear-figures clean-demo
+.PHONY: setup demo test lint bench mutants fuzz faults push-figures grasp-figures clear-figures clean-demo
 
 setup: .venv/.installed
-
 .venv/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(INSTALL) '.[dev]'
@@ -35,6 +35,6 @@ push-figures: setup ; $(BIN)/python -m experiments.push_prediction
 grasp-figures: setup ; $(BIN)/python -m experiments.grasping
 clear-figures: setup ; $(BIN)/python -m experiments.clearing
 mutants: setup ; $(INSTALL) '.[dev,mutants]' && $(BIN)/python -m experiments.mutants
-
-clean-demo:
-	rm -rf demo
+fuzz: setup ; $(BIN)/python -m experiments.fuzz
+faults: setup ; $(BIN)/python -m experiments.faults
+clean-demo: ; rm -rf demo
