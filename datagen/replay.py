@@ -61,7 +61,7 @@ class Set:
         """Return the engine called `name`, or that which made the data set, as it was then."""
         if name is None and timestep is None:
             timestep = self.config.get("timestep")
-        return make_engine(name or self.config["engine"], timestep=timestep, threads=threads)
+        return make_engine(name or self.config.get("engine", "auto"), timestep=timestep, threads=threads)
 
 
 @dataclasses.dataclass(frozen=True)
