@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import console, structs
+from dipn_jax import console, machine, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
@@ -28,6 +28,7 @@ class Set:
     config: dict[str, Any]  # with which it was made
     episodes: Any  # [B]
     old_shards: int  # that do not hold the exact start of their episodes
+    instructions: tuple[str, ...] = ()  # instruction sets that it was made with, other than that of this processor
 
     def everything(self) -> np.ndarray:
         """Return the numbers of all episodes."""
@@ -60,7 +61,7 @@ class Set:
         """Return the engine called `name`, or that which made the data set, as it was then."""
         if name is None and timestep is None:
             timestep = self.config.get("timestep")
-        return make_engine(name or self.config["engine"], timestep=timestep, threads=threads)
+        return make_engine(name or self.config.get("engine", "auto"), timestep=timestep, threads=threads)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,8 +93,10 @@ def open_set(folder: pathlib.Path) -> Set:
         )
     episodes, _ = records.load(folder, kind=kind)
     paths = sorted(folder.glob("shard-*.parquet"))
-    old = sum(shards.read_meta(path).get("start") != shards.ROUNDED_START for path in paths)
-    return Set(folder, kind, about["config"], episodes, old)
+    metas = [shards.read_meta(path) for path in paths]
+    old = sum(meta.get("start") != shards.ROUNDED_START for meta in metas)
+    others = {str(meta.get("instructions", machine.instructions())) for meta in metas} - {machine.instructions()}
+    return Set(folder, kind, about["config"], episodes, old, tuple(sorted(others)))
 
 
 def replayed(episodes: Any, engine: Engine) -> Any:
@@ -164,6 +167,11 @@ def report(data: Set, chosen: np.ndarray, engine: Engine, tolerance: float | Non
         console.warn(
             f"{data.folder}: {data.old_shards} shards are older than exact replay: their episodes began within half a "
             "micrometre of what is stored, which contact makes millimetres of"
+        )
+    if data.instructions:
+        console.warn(
+            f"{data.folder}: made with {', '.join(data.instructions)}, replayed with {machine.instructions()}: other "
+            "instruction sets change the last digits, which contact makes more of"
         )
     found: list[Difference] = []
     with console.Progress("replay", len(chosen), unit="episodes") as progress:

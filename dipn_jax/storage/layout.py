@@ -39,6 +39,7 @@ META = {
     "versions": {str: str},
     "processor?": str,
     "instructions?": str,
+    "start?": str,
 }
 """Form of the metadata of a shard."""
 

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from dipn_jax.datagen import cli, replay
 
-from dipn_jax import console, structs
+from dipn_jax import console, machine, structs
 from dipn_jax.storage import codec, records, shards
 
 
@@ -115,6 +115,12 @@ def test_shards_from_before_replay_are_named(
     assert "warning" not in call(data["push"], 0)[2]
     meta = json.loads(pq.read_schema(shards.shard_path(data["push"], 0)).metadata[b"dipn_jax"])
     assert meta["start"] == "rounded"
+
+
+def test_another_instruction_set_is_named(data: dict[str, pathlib.Path], monkeypatch: pytest.MonkeyPatch, call) -> None:
+    here = machine.instructions()
+    monkeypatch.setattr(machine, "instructions", lambda: "sparc")
+    assert f"made with {here}, replayed with sparc" in call(data["push"], 0)[2]
 
 
 def test_a_sample_is_drawn_without_repeats(data: dict[str, pathlib.Path], call) -> None:
