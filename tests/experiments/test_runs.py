@@ -196,3 +196,13 @@ def test_an_interrupted_command_saves_and_continues(tmp_path: pathlib.Path, numb
     assert files.read_json(tmp_path / "slow" / runs.STAMP)["complete"] is False
     assert subprocess.run(words, cwd=ROOT, check=False).returncode == 0
     assert files.read_json(tmp_path / "slow" / runs.STAMP)["complete"] is True
+
+
+def test_a_stamp_that_does_not_fit_is_one_line(tmp_path: pathlib.Path) -> None:
+    run = Run("a", tmp_path, ("true",))
+    runs.write_stamp(run, "key", complete=True)
+    stamp = files.read_json(tmp_path / runs.STAMP)
+    for wrong in ({"made_by": [1]}, {"complete": "yes"}, {"versions": []}):
+        files.write_json(tmp_path / runs.STAMP, stamp | wrong)
+        with pytest.raises(UserError, match=rf"stamp\.json: damaged, {next(iter(wrong))}"):
+            runs.read_stamp(run)

@@ -2,8 +2,13 @@ import pathlib
 from typing import Any
 
 import numpy as np
+import pytest
 from dipn_jax.eval.clearing import film
 from dipn_jax.eval.report import comparison
+
+from dipn_jax import files
+from dipn_jax.errors import UserError
+from experiments.fuzz_parsers import PARSERS
 
 
 def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib.Path) -> None:
@@ -29,3 +34,13 @@ def test_the_course_of_clearing_is_the_share_left_after_each_action(cleared: Any
     late = [(t.scene.shape >= 0).sum() / t.objects for t in tables]
     wanted = np.mean([a if len(t.film) > t.objects else b for t, a, b in zip(tables, after, late, strict=True)])
     np.testing.assert_allclose(comparison.course(comparison.Cleared(out), np.ones(1)), wanted)
+
+
+def test_metrics_that_are_no_numbers_are_one_line(tmp_path: pathlib.Path) -> None:
+    PARSERS["metrics"].prepare(tmp_path)
+    values = files.read_json(tmp_path / "metrics.json")
+    assert comparison.Cleared(tmp_path).values == values
+    for wrong in ({"completion": "all"}, {"grasps": 1.5}, {"pushes": None}):
+        files.write_json(tmp_path / "metrics.json", values | wrong)
+        with pytest.raises(UserError, match=rf"metrics\.json: damaged, {next(iter(wrong))} is"):
+            comparison.Cleared(tmp_path)
