@@ -11,7 +11,6 @@ import dataclasses
 import errno
 import functools
 import hashlib
-import logging
 import os
 import pathlib
 import shutil
@@ -26,7 +25,7 @@ from flax import nnx
 from dipn_jax import console, files, forking, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
-from dipn_jax.storage import stored_step
+from dipn_jax.storage import quiet, stored_step
 
 WANTED = "give a run (the --out of dipn-train), one step of it (RUN@STEP) or that step's folder (RUN/checkpoints/STEP)"
 """What is accepted where a network is asked for, for messages."""
@@ -96,13 +95,11 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
     """
     folder.mkdir(parents=True)
     checkpointer = ocp.StandardCheckpointer()
-    absl = logging.getLogger("absl")
-    level = absl.level
-    absl.setLevel(logging.CRITICAL)  # Orbax logs a traceback of what is said in one line below
     try:
-        for name, tree in parts.items():
-            checkpointer.save(folder / name, _flat(tree))
-        checkpointer.wait_until_finished()
+        with quiet.failing():  # what Orbax prints is said in one line below
+            for name, tree in parts.items():
+                checkpointer.save(folder / name, _flat(tree))
+            checkpointer.wait_until_finished()
     except Exception as error:  # TensorStore has errors of its own for what the system says
         reason = _system_error(error)
         if reason is None:
@@ -111,8 +108,6 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
             f"{folder.parents[1]}: step {about['step']} cannot be saved ({reason}); earlier steps are whole; make "
             "space and give the same command to go on"
         ) from None
-    finally:
-        absl.setLevel(level)
     for marker in folder.rglob("commit_success.txt"):  # Orbax writes the present folder into it
         marker.write_bytes(b"Checkpoint commit was successful\n")
     stored = sorted(p for p in folder.rglob("*") if p.is_file())

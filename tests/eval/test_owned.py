@@ -9,13 +9,14 @@ from dipn_jax.eval import cli
 from dipn_jax import console
 from dipn_jax.storage import owner
 
+_FEW = ("--cases", "random", "--objects", "1")
 COMMANDS = {
-    "clear": ("--method", "gn", "--grasp-net", "grasp"),
-    "sweep": ("--push-net", "dipn", "--grasp-net", "grasp", "--distances", "0.05:0.05:0.01"),
-    "grasp": ("--grasp-net", "grasp"),
-    "prediction": ("--push-net", "dipn"),
+    "clear": ("--method", "gn", "--grasp-net", "grasp", *_FEW),
+    "sweep": ("--push-net", "dipn", "--grasp-net", "grasp", "--distances", "0.05:0.05:0.01", "--pushes", "0", *_FEW),
+    "grasp": ("--grasp-net", "grasp", "--scenes", "1", "--objects", "1"),
+    "prediction": ("--push-net", "dipn", "--scenes", "1", "--objects", "1"),
 }
-"""Commands that a folder belongs to while they work, and the networks that they need."""
+"""Commands that a folder belongs to while they work, and the networks that they need; small, should they begin."""
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -94,3 +94,23 @@ def test_a_step_that_cannot_be_saved_ends_the_run_with_one_line(
     assert (found and found[1]["step"]) == (None if step == 3 else 3)
     monkeypatch.setattr(checkpoint, "_write", write)
     assert fit(task, BRIEF, tmp_path) and checkpoint.newest(tmp_path)[1]["step"] == 6  # type: ignore[index]
+
+
+def test_an_interrupted_run_says_that_its_last_step_cannot_be_saved(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not that the same command continues from there."""
+    task = _task("push", data)
+    fetch = task.fetch
+
+    def interrupt(index: np.ndarray) -> object:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return fetch(index)
+
+    def full(*_: Any) -> None:
+        raise UserError("step 1 cannot be saved")
+
+    monkeypatch.setattr(task, "fetch", interrupt)
+    monkeypatch.setattr(checkpoint, "_write", full)
+    with pytest.raises(UserError, match="step 1 cannot be saved"):
+        fit(task, BRIEF, tmp_path)

@@ -2,7 +2,9 @@
 
 import errno
 import pathlib
+import sys
 import threading
+import types
 from typing import Any
 
 import jax
@@ -12,7 +14,7 @@ import pytest
 
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, quiet
 from dipn_jax.storage.saving import Saver
 
 PATIENCE = 60.0
@@ -117,3 +119,22 @@ def test_a_step_has_its_name_only_when_it_is_synced(tmp_path: pathlib.Path, monk
     with pytest.raises(OSError, match="No space left"), _saver(tmp_path) as saver:
         saver.save(2, {"model": {"x": np.zeros(3)}}, extra={})
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["00000001"]
+
+
+def test_a_save_that_fails_prints_nothing_of_closed_event_loops_and_all_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """TensorStore's threads report to a loop that Orbax has closed, during a failed save and after it."""
+    printed: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda each: printed.append(str(each.exc_value)))
+
+    def report(text: str) -> None:
+        sys.unraisablehook(types.SimpleNamespace(exc_value=RuntimeError(text)))  # type: ignore[arg-type]
+
+    with quiet.failing():
+        report("Event loop is closed")
+    report("Event loop is closed")
+    assert printed == ["Event loop is closed"], "a save that succeeds leaves things as they were"
+    with pytest.raises(ValueError, match="full"), quiet.failing():
+        raise ValueError("full")
+    report("Event loop is closed")
+    report("something else")
+    assert printed[1:] == ["something else"]
