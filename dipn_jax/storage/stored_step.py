@@ -51,18 +51,24 @@ def _form(default: Any) -> typed.Form:
     return typed.Whole(1, LARGEST) if type(default) is int else type(default)
 
 
+_COUNTS_OF_LAYERS = ("stages", "blocks", "rounds")
+"""Fields of configs that count layers, each of which has arrays of its own."""
+
+
 def require_room(part: pathlib.Path, config: Any) -> None:
     """Raise a UserError where a config is of a larger network than the stored arrays, before memory is taken for it.
 
     Args:
       part: folder of the network's arrays.
-      config: its config; no number in it is above the number of arrays, or the largest of their sizes.
+      config: its config; no number of layers in it is above the number of arrays, no size above the largest of theirs.
     """
     shapes = [one.shape for one in _stored(part).values()]
     largest = max([len(shapes), *(size for shape in shapes for size in shape)])
-    for value in dataclasses.astuple(config):
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        most = len(shapes) if field.name in _COUNTS_OF_LAYERS else largest
         for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, int) and number > largest:
+            if isinstance(number, int) and number > most:
                 raise UserError(f"checkpoint {part}: its config is of a larger network than its arrays; train again")
 
 

@@ -77,14 +77,10 @@ def test_json_is_parsed_with_or_without_a_byte_order_mark() -> None:
     assert typed.parse(b'\xef\xbb\xbf{"a": [1, 2.5, "\xc3\xa4"]}') == typed.parse('{"a": [1, 2.5, "\u00e4"]}')
 
 
-@pytest.mark.parametrize(
-    "name", ["", "/etc/hosts", "../x", "a/../../x", "link", "sub/x", "..", "\0", "a\\b", "x" * 5000]
-)
+@pytest.mark.parametrize("name", ["", "/etc/hosts", "../x", "a/../../x", "..", "\0", "a\\b", "x" * 5000, "\udc80"])
 def test_names_do_not_lead_out_of_a_folder(tmp_path: pathlib.Path, name: str) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "x").touch()
-    (tmp_path / "in" / "link").symlink_to(tmp_path / "x")
-    (tmp_path / "in" / "sub").symlink_to(tmp_path)
     with pytest.raises(typed.Misfit, match="is no file inside"):
         typed.inside(tmp_path / "in", name)
 
@@ -93,3 +89,5 @@ def test_names_inside_a_folder_are_paths(tmp_path: pathlib.Path) -> None:
     (tmp_path / "other").symlink_to(tmp_path)
     assert typed.inside(tmp_path, "a/b.txt") == tmp_path / "a" / "b.txt"
     assert typed.inside(tmp_path / "other", "a") == tmp_path / "other" / "a", "the folder itself may be a link"
+    (tmp_path / "link").symlink_to(tmp_path.parent / "x")
+    assert typed.inside(tmp_path, "link") == tmp_path / "link", "and the file"
