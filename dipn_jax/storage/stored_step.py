@@ -53,6 +53,8 @@ def _form(default: Any) -> typed.Form:
 
 _COUNTS_OF_LAYERS = ("stages", "blocks", "rounds")
 """Fields of configs that count layers, each of which has arrays of its own."""
+_LAYERS = 32
+"""Layers that are never too many; a preset does not use all fields, so a small network may have large ones."""
 
 
 def require_room(part: pathlib.Path, config: Any) -> None:
@@ -66,7 +68,7 @@ def require_room(part: pathlib.Path, config: Any) -> None:
     largest = max([len(shapes), *(size for shape in shapes for size in shape)])
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        most = len(shapes) if field.name in _COUNTS_OF_LAYERS else largest
+        most = max(len(shapes), _LAYERS) if field.name in _COUNTS_OF_LAYERS else largest
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, int) and number > most:
                 raise UserError(f"checkpoint {part}: its config is of a larger network than its arrays; train again")

@@ -37,7 +37,7 @@ def test_the_first_unsure_state_is_where_both_ways_begin(settled: Any) -> None:
     table.film = [step(0.9, 5, 0), step(0.71, 4, 1), step(0.7, 3, 2), step(0.1, 2, 0)]
     assert push_or_grasp._first_unsure(table) == 2
     begun = push_or_grasp._at(table, 2)
-    assert begun.objects == 3 and len(begun.missed) == 2 and begun.actions == 0
+    assert begun.objects == 3 and len(begun.missed.grasps) == 2 and begun.actions == 0
     np.testing.assert_array_equal(begun.poses, settled.poses[0] + 3)
     table.film = table.film[:2]
     assert push_or_grasp._first_unsure(table) is None

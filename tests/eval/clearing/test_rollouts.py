@@ -58,18 +58,18 @@ def tables(settled: SettledScene) -> SettledScene:
 
 
 def _decide(tables: SettledScene, engine: Records) -> Decision:
-    decision, label = rollouts.decide(
+    decision, seen = rollouts.decide(
         jax.random.split(jax.random.key(0), 3),
         tables.scene,
         tables.poses,
-        np.repeat(planner.NONE_MISSED[None], 3, 0),
+        lambda heights: np.repeat(planner.NONE_MISSED[None], len(heights), 0),
         scorer=half,
         summarize=_summarize,
         engine=engine,  # type: ignore[arg-type]
         rule=PUSH_ALWAYS,
         distances=np.full(3, 0.1, np.float32),
     )
-    np.testing.assert_array_equal(label, render.observe(tables.scene, tables.poses).label)
+    np.testing.assert_array_equal(seen.label, render.observe(tables.scene, tables.poses).label)
     return decision
 
 
