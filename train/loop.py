@@ -16,7 +16,7 @@ import optax
 import tensorboardX
 from flax import nnx
 
-from dipn_jax import console, files, seeds
+from dipn_jax import console, files, seeds, typed
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner, saving
@@ -245,8 +245,8 @@ def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> 
 def _step_of(line: str) -> float:
     """Return the step of a line of `metrics.jsonl`; infinite if a hard stop cut the line."""
     try:
-        return float(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
+        return float(typed.check(typed.parse(line), {"step": float})["step"])
+    except typed.Misfit:
         return float("inf")
 
 
@@ -267,8 +267,8 @@ class _Log:
             self.events.add_scalar(name, value, step)
 
     def last(self) -> dict[str, float]:
-        lines = files.read_text(self.path).splitlines()
-        return json.loads(lines[-1]) if lines else {}
+        lines = files.read_lines(self.path)
+        return lines[-1] if lines else {}
 
     def close(self) -> None:
         self.events.close()
