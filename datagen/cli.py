@@ -6,14 +6,12 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
-
-import tyro
+from typing import TYPE_CHECKING, Any
 
 from dipn_jax import console
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
-from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
+from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
 from . import upkeep
 from .check_command import check_world
@@ -23,9 +21,6 @@ if TYPE_CHECKING:
     from dipn_jax.planning.planner import Scorer
 
     from .generate import Job
-
-Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
-"""Number of objects in a scene."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ _MOST = 2**63 - 1
 
 
 class Misfit(ValueError):
-    """A text that is no JSON, or a value that does not fit: one line that says where, what came and what is wanted."""
+    """A text that is no JSON, or a value that does not fit: one line that says where, what it is and what is wanted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +171,7 @@ def one_line(text: str, *, most: int = 60) -> str:
 def inside(folder: pathlib.Path, name: str) -> pathlib.Path:
     """Return the path of a file that stands in `folder` under a name that was read from a file.
 
-    The file may be a link, as in data sets of DVC, git-annex or the Hugging Face hub: whoever made it chose where to.
+    The file may be a link, as in data sets of DVC, git-annex or the Hugging Face hub.
 
     Raises:
       Misfit: the name leads out of the folder: it is absolute, or has `..`.

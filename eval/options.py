@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Annotated, Any
-
-import tyro
+from typing import TYPE_CHECKING, Any
 
 from dipn_jax import console
 
 if TYPE_CHECKING:
     from dipn_jax.storage import resume
-
-Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
-"""Number of objects in a scene."""
 
 
 def check(out: pathlib.Path, seed: int, **counts: int) -> None:

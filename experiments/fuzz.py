@@ -33,14 +33,14 @@ from experiments.fuzz_parsers import Parser
 RESULTS = "reliability"
 """Name of the file in docs."""
 OUTCOMES = ("accepted", "refused", "tracebacks")
-"""What can come of an input."""
+"""The outcomes that an input can have."""
 SHOWN = 5
 """Tracebacks that are shown of each parser."""
 
 
 @dataclasses.dataclass
 class Count:
-    """What came of the inputs of a parser."""
+    """How many inputs of a parser had each outcome."""
 
     outcomes: collections.Counter[str]
     failures: list[str]  # tracebacks, the first ones, each kind once

@@ -120,7 +120,7 @@ PROMISES = (
         _fuzz,
     ),
     Promise(
-        "A folder of a training or an evaluation has one owner at a time; a second one is told who has it.",
+        "A folder of a training or an evaluation has one owner at a time; a second one stops and names it.",
         (
             f"{_STORAGE}/test_owner.py::test_the_second_is_told_who_has_it_and_a_dead_owner_does_not_block",
             "tests/train/test_loop.py::test_a_run_that_is_going_on_is_not_started_again",

@@ -160,7 +160,7 @@ def test_text_files_are_read_and_written_as_utf8() -> None:
 
 
 def test_nothing_is_pickled() -> None:
-    """No module unpickles, which would run what is in a file; NumPy is told not to at every call that could."""
+    """Unpickling would run what is in a file; every call of NumPy that could do so has `allow_pickle=False`."""
     forbidden = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
     for package in (*PACKAGES, *TOPS):
         for path in (ROOT / package).rglob("*.py"):

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from dipn_jax import console
 from dipn_jax.names import EngineName
-from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
+from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
 from .configs import BaselineConfig, OnlineConfig
 
-Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
-"""Number of objects on a fresh table."""
 GRASP_ONLINE = OnlineConfig()
 """How `grasp-online` learns unless told otherwise."""
 BASELINE = BaselineConfig()

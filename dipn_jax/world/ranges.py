@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
+
+import tyro
 
 from dipn_jax.errors import UserError
 
+Objects = Annotated[str, tyro.conf.arg(help="How many: 10, 1:7 (uniform), or `paper` (1 to 7, as published).")]
+"""Number of objects in a scene, an option of the commands; `scenes.parse_objects` reads it."""
 Range: TypeAlias = tuple[float, float]
 """Smallest and largest value."""
 BOUNDS = {"scale": (0.5, 1.2), "density": (10.0, 25_000.0), "friction": (0.01, 5.0)}

@@ -11,7 +11,7 @@ import tyro
 from dipn_jax import console
 from dipn_jax.errors import UserError
 from dipn_jax.names import ALL_AIDS, Aid, EngineName
-from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
+from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
 from .. import options
 from ..clearing.camera import DEFAULT_CAMERA, Camera
@@ -22,7 +22,7 @@ def grasp(
     grasp_net: pathlib.Path | None = None,
     curve: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="curve")] = (),
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 100,
-    objects: options.Objects = "10",
+    objects: Objects = "10",
     seed: int = 1_000_000,
     others: int = 0,
     aids: tuple[Aid, ...] = ALL_AIDS,

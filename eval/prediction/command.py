@@ -9,7 +9,7 @@ import tyro
 
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
-from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
+from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
 from .. import options
 
@@ -22,7 +22,7 @@ def predict(
     push_net: pathlib.Path | None = None,
     curve: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="curve")] = (),
     scenes_: Annotated[int, tyro.conf.arg(name="scenes")] = 300,
-    objects: options.Objects = "1:7",
+    objects: Objects = "1:7",
     seed: int = 1_000_000,
     engine: EngineName = "auto",
     threads: int | None = None,
