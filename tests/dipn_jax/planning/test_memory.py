@@ -81,7 +81,7 @@ def test_changed_pixels_are_counted_in_a_disk() -> None:
         cv2.circle(after, (112 + apart, 112), radius, 0.02, -1)
         assert _remembered(before, after) == kept, (apart, radius)
     corner = before.copy()
-    corner[112 + 26 : 112 + 31, 112 + 26 : 112 + 40] = 0.02
+    corner[112 + 22 : 112 + 31, 112 + 22 : 112 + 31] = 0.02  # 81 pixels, all of them over 30 away
     assert _remembered(before, corner), "in the square around the disk only"
     low = before.copy()
     low[90:130, 90:130] = memory.CHANGED_HEIGHT * 0.99

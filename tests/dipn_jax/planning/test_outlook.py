@@ -68,11 +68,18 @@ def test_a_push_is_made_where_it_saves_more_than_itself(row: Observation) -> Non
     assert still.value_push == pytest.approx(-1 - four, rel=1e-5) and not still.is_push, "it changes nothing"
 
 
+def staggered(observation: Observation, pushes: Push) -> jax.Array:
+    """Predict that every push moves the blocks by 7 pixels along the columns, one up and the next one down."""
+    return jnp.zeros((COUNT, SLOTS, 3)).at[:, :4, 1].set(jnp.array([0.014, -0.014, 0.014, -0.014]))
+
+
 def test_a_miss_is_held_against_what_has_not_moved_only(row: Observation) -> None:
-    missed = np.array([[turn, 105, 85 + 13 * slot] for slot in range(4) for turn in (0, 3, 6)], np.int32)
-    decision, before = _decide(row, spread, apart, missed), _decide(row, spread, apart)
+    places = [(turn, at, 85 + 13 * slot) for slot in range(4) for turn in (0, 3, 6) for at in (97, 105, 113)]
+    missed = np.array(places, np.int32)
+    decision, before = _decide(row, staggered, apart, missed), _decide(row, staggered, apart)
     assert decision.value_now < before.value_now - 0.1
-    assert decision.value_push == pytest.approx(-1.0), "all four have moved away"
+    assert before.value_push == pytest.approx(-1.0), "all four are apart"
+    assert decision.value_push == pytest.approx(-1.0), "all four have moved, and not out of reach of the misses"
     still = _decide(row, predictors.static_predictor, apart, missed)
     assert still.value_push == pytest.approx(float(decision.value_now) - 1, rel=1e-5)
 
