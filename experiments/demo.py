@@ -19,31 +19,34 @@ from dipn_jax.errors import UserError
 from experiments import command, pages
 from experiments.runs import Recipe, Run
 
+PUSHES, GRASPS = 1000, 1000
+"""Episodes that the two networks learn from."""
+
 
 def list_runs(root: pathlib.Path) -> list[Run]:
     """Return the demo's commands, which write to `root`."""
     run = Recipe(root)
 
     # episodes
-    pushes = run("data/push", "dipn-datagen push --episodes 1500")
+    pushes = run("data/push", f"dipn-datagen push --episodes {PUSHES}")
     images = run("data/images", "dipn-datagen images --episodes 100")
     pretrained = run("runs/gn-pretrained", "dipn-train grasp-pretrain --steps 200 --data", images)
     grasps = run(
         "data/grasp",
-        "dipn-datagen grasp --objects 1:10 --episodes 1500 --shard-size 500 --grasp-net",
+        f"dipn-datagen grasp --objects 1:10 --episodes {GRASPS} --shard-size 500 --grasp-net",
         pretrained,
     )
 
     # networks
-    dipn = run("runs/dipn", "dipn-train push --steps 1000 --data", pushes)
-    gn = run("runs/gn", "dipn-train grasp --steps 500 --data", grasps, "--init", pretrained)
+    dipn = run("runs/dipn", "dipn-train push --steps 800 --data", pushes)
+    gn = run("runs/gn", "dipn-train grasp --steps 400 --data", grasps, "--init", pretrained)
 
     # what they are worth
-    prediction = run("eval/prediction", "dipn-eval prediction --scenes 200 --push-net", dipn)
-    success = run("eval/grasp", "dipn-eval grasp --scenes 40 --grasp-net", gn)
+    prediction = run("eval/prediction", "dipn-eval prediction --scenes 100 --push-net", dipn)
+    success = run("eval/grasp", "dipn-eval grasp --scenes 20 --grasp-net", gn)
     networks = ("--push-net", dipn, "--grasp-net", gn)
     hard = run("eval/hard", "dipn-eval clear --cases hard --candidates 16", *networks)
-    random = run("eval/random", "dipn-eval clear --cases random --objects 10 --instances 6 --candidates 16", *networks)
+    random = run("eval/random", "dipn-eval clear --cases random --objects 10 --instances 4 --candidates 16", *networks)
 
     evaluations = ("--prediction", prediction, "--grasp", success, "--clear", [hard, random])
     run("report", "dipn-eval report", *evaluations, "--runs", [dipn, pretrained, gn], out=root)
@@ -51,7 +54,7 @@ def list_runs(root: pathlib.Path) -> list[Run]:
 
 
 PREDICTORS = {
-    "dipn": "DIPN (`compact`, 1,500 pushes, a tenth of them held out)",
+    "dipn": f"DIPN (`compact`, {PUSHES:,} pushes, a tenth of them held out)",
     "trans": "`trans`: only the pushed object moves",
     "static": "`static`: nothing moves",
     "physics": "the engine itself, nominal mass and friction",
@@ -79,7 +82,7 @@ def tables(values: dict[str, Any]) -> list[str]:
         [title, *(f"{values[f'push_error/{name}/{column}']:.3f}" for column in columns)]
         for name, title in PREDICTORS.items()
     ]
-    gn = f"GN (`compact`, 1,500 grasps, a tenth of them held out): all {values['attempts']} until the tables were empty"
+    gn = f"GN (`compact`, {GRASPS:,} grasps, a tenth of them held out): all {values['attempts']} until empty"
     grasps = [
         [title, _share(values, f"grasp_success/{name}")]
         for name, title in (

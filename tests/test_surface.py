@@ -18,7 +18,8 @@ from flax import nnx
 import dipn_jax
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.planning import predictors
+from dipn_jax.planning import methods, predictors
+from dipn_jax.planning.methods import PolicyConfig
 from dipn_jax.storage import checkpoint
 from dipn_jax.world.cases import hard_cases_path
 
@@ -85,6 +86,14 @@ def test_structs_are_indexed_by_row(settled: Any) -> None:
     np.testing.assert_array_equal(some.mass, settled.scene.mass[[4, 1]])
     seen = jax.vmap(dipn_jax.render)(settled.scene, settled.poses)
     assert seen[1].slots == 5 and seen[1].height.shape == (224, 224)
+
+
+def test_policies_of_the_shipped_networks_share_what_is_compiled_unless_their_aids_differ() -> None:
+    one = methods.load_policy("dipn+gn")
+    other = methods.load_policy("dipn+gn", config=PolicyConfig(gamma=0.5, candidates=4))
+    assert other.act is one.act and other.rule.gamma == 0.5 and len(other.distances) == 4
+    bare = methods.load_policy("dipn+gn", config=PolicyConfig(aids=()))
+    assert bare.act is not one.act and bare.rule.draw_all
 
 
 def test_a_policy_is_loaded_by_its_name(settled: Any) -> None:

@@ -6,6 +6,7 @@ A new method is an entry of `METHODS`, and its name one of `names.MethodName`, w
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Callable
 from typing import Any, Literal, get_args
@@ -165,10 +166,31 @@ def load_policy(
         state (`physics+gn`).
     """
     paths = (None if run is None else pathlib.Path(run) for run in (push_net, grasp_net, value_net))
-    build = find(method).build
-    if build is None:
+    if find(method).build is None:
         raise UserError(f"--method {method}: decides on the simulator's state, not on an image; run dipn-eval clear")
-    return build(Networks(*paths).runs(method), config)
+    return build(find(method), Networks(*paths).runs(method), config)
+
+
+def build(method: Method, runs: Runs, config: PolicyConfig) -> Policy:
+    """Return the policy of a method that decides on images, with networks of given runs.
+
+    Where all of them come with the package, policies with the same aids share what is compiled.
+    """
+    assert method.build is not None
+    if not all(run.is_relative_to(checkpoint.SHIPPED) for run in runs.values()):
+        return method.build(runs, config)
+    shared = _of_shipped(method.build, tuple(runs.items()), config.released, config.aids)
+    return shared.with_config(config) if method.pushes else shared
+
+
+@functools.cache
+def _of_shipped(
+    build: Callable[[Runs, PolicyConfig], Policy],
+    runs: tuple[tuple[str, pathlib.Path], ...],
+    released: bool,
+    aids: tuple[Aid, ...],
+) -> Policy:
+    return build(dict(runs), PolicyConfig(released=released, aids=aids))
 
 
 def grasping_policy(scorer: Scorer, config: PolicyConfig = PolicyConfig()) -> Policy:

@@ -87,17 +87,41 @@ def _join(regions: np.ndarray, image: np.ndarray, height: np.ndarray) -> np.ndar
     """Merge regions of one colour where only something higher lies between them: they are one object."""
     numbers = [n for n in np.unique(regions) if n]
     mean = {n: np.median(image[regions == n], 0) for n in numbers}
+    boxes = {n: _box(regions == n) for n in numbers}
     for i, a in enumerate(numbers):
         for b in numbers[i + 1 :]:
-            if np.abs(mean[a] - mean[b]).max() <= SAME_COLOR / 2 and _bridged(regions == a, regions == b, height):
+            if a not in boxes or b not in boxes or _apart(boxes[a], boxes[b]) > _BRIDGED_PIXELS + 2:
+                continue  # + 2: OpenCV's distances are up to 2 % too short
+            around = _around(boxes[a], boxes[b])
+            near = regions[around]
+            if np.abs(mean[a] - mean[b]).max() <= SAME_COLOR / 2 and _bridged(near == a, near == b, height[around]):
                 regions = np.where(regions == b, a, regions)
+                boxes[a] = _box(regions == a)
+                del boxes[b]
     return regions
+
+
+def _box(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Return the first and last row, and the first and last column, of a mask that is not empty."""
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return int(rows[0]), int(rows[-1]), int(cols[0]), int(cols[-1])
+
+
+def _apart(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> float:
+    """Return by how many pixels two boxes are apart; 0 where they overlap."""
+    down = max(one[0] - other[1], other[0] - one[1], 0)
+    right = max(one[2] - other[3], other[2] - one[3], 0)
+    return float(np.hypot(down, right))
+
+
+def _around(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest box around two boxes."""
+    rows, cols = (min(one[0], other[0]), max(one[1], other[1])), (min(one[2], other[2]), max(one[3], other[3]))
+    return slice(rows[0], rows[1] + 1), slice(cols[0], cols[1] + 1)
 
 
 def _bridged(first: np.ndarray, second: np.ndarray, height: np.ndarray) -> bool:
     """Return whether the shortest line between two masks is short and passes under something higher than both."""
-    if not first.any() or not second.any():
-        return False
     far, nearest = cv2.distanceTransformWithLabels(
         (~first).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )

@@ -29,6 +29,8 @@ from dipn_jax.storage import quiet, stored_step
 
 WANTED = "give a run (the --out of dipn-train), one step of it (RUN@STEP) or that step's folder (RUN/checkpoints/STEP)"
 """What is accepted where a network is asked for, for messages."""
+SHIPPED = pathlib.Path(__file__).parents[1] / "data"
+"""Folder of the runs that come with the package, one a network."""
 FORMAT_VERSION = 1
 """Version of the format; steps of another version are ignored."""
 NETWORKS: dict[str, tuple[type, type]] = {
@@ -245,7 +247,7 @@ def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
         raise UserError(f"checkpoint {run}: no such step of {base}; {kept}")
     if str(run) != "builtin":
         return files.absolute(run)
-    folder = pathlib.Path(__file__).parents[1] / "data" / network
+    folder = SHIPPED / network
     if not folder.is_dir():
         raise UserError(f"builtin: no {network} network comes with this package; give the --out of a dipn-train run")
     return folder

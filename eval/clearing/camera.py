@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
+import functools
 from typing import TYPE_CHECKING, Any, Literal
 
 from dipn_jax.errors import UserError
@@ -55,6 +57,7 @@ class Camera:
         import jax
         import numpy as np
 
+        from dipn_jax import physics
         from dipn_jax.sight import render, segment
 
         seen: Observation = jax.device_get(render.observe(scene, poses))
@@ -67,8 +70,9 @@ class Camera:
             seen = seen.replace(height=np.stack([one[0] for one in noisy]), color=np.stack([one[1] for one in noisy]))
         if self.masks == "true":
             return seen
-        images = zip(seen.height, seen.color, strict=True)
-        return seen.replace(label=np.stack([segment.segment(*image, slots=seen.slots) for image in images]))
+        found = functools.partial(segment.segment, slots=seen.slots)
+        with concurrent.futures.ThreadPoolExecutor(physics.cores()) as pool:
+            return seen.replace(label=np.stack(list(pool.map(found, seen.height, seen.color))))
 
     def _disturb(
         self, rng: np.random.Generator, height: np.ndarray, color: np.ndarray

@@ -40,15 +40,15 @@ def load(
     Raises:
       UserError: a network that the method needs was not given, or is another; or a camera for `physics+gn`.
     """
-    build, runs = methods.find(method).build, networks.runs(method)
-    if build is None:
+    found, runs = methods.find(method), networks.runs(method)
+    if found.build is None:
         if camera.noisy or camera.masks != "true":
             raise UserError(f"--method {method}: decides on the simulator's state; give --masks true, and no noise")
         scorer, summarize = methods.gn_scores(runs["grasp"], configs[0])
         decide = functools.partial(rollouts.decide, scorer=scorer, summarize=summarize, engine=engine)
         return [functools.partial(decide, rule=each.rule(), distances=each.spread()) for each in configs]
-    policy = build(runs, configs[0])
-    if not methods.find(method).pushes:
+    policy = methods.build(found, runs, configs[0])
+    if not found.pushes:
         return [in_lockstep(policy, camera=camera)] * len(configs)
     return [in_lockstep(policy.with_config(each), camera=camera) for each in configs]
 

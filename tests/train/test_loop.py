@@ -122,12 +122,12 @@ def test_grasp_tasks_fit_their_training_data(data: dict[str, pathlib.Path], tmp_
     config = GraspConfig(width=8)
     pretrain = PretrainTask(data["images"], config)
     first = fit(
-        pretrain, TrainConfig(steps=100, batch=3, learning_rate=5e-3, eval_every=100, save_every=100), tmp_path / "a"
+        pretrain, TrainConfig(steps=60, batch=3, learning_rate=5e-3, eval_every=60, save_every=60), tmp_path / "a"
     )
     assert first["held_out_loss"] < 0.5
     initial = checkpoint.load_network(tmp_path / "a", network="grasp")
     task = GraspTask((data["grasp"],), config)
-    plan = TrainConfig(steps=250, batch=16, learning_rate=5e-3, eval_every=250, save_every=250)
+    plan = TrainConfig(steps=120, batch=16, learning_rate=5e-3, eval_every=120, save_every=120)
     fit(task, plan, tmp_path / "b", initial=initial)
     rate = task.train_set.success.mean()
     entropy = -(rate * np.log(rate) + (1 - rate) * np.log(1 - rate))

@@ -56,16 +56,17 @@ import jax, numpy as np
 from dipn_jax import console
 from dipn_jax.world import primitives, scenes
 from dipn_jax.physics.mjx import MjxEngine
+from dipn_jax.physics.native import NativeEngine
 console.enable_compilation_cache()
 assert jax.device_count() == 4
 keys, config = jax.random.split(jax.random.key(0), 8), scenes.fixed_count(1)
 scene, poses = jax.tree.map(np.asarray, jax.vmap(lambda key: scenes.random_scene(key, config=config))(keys))
-many, one = MjxEngine(), MjxEngine(devices=jax.devices()[:1])
-found, wanted = (primitives.settle(e, scene, poses, duration=0.1, fence=0.1) for e in (many, one))
-np.testing.assert_allclose(found.poses, wanted.poses, atol=1e-6)
+many = MjxEngine()
+found, wanted = (primitives.settle(e, scene, poses, duration=0.1) for e in (many, NativeEngine(many.config)))
+np.testing.assert_allclose(found.poses[..., :3], wanted.poses[..., :3], atol=1e-3)
 np.testing.assert_array_equal(found.fault, wanted.fault)
 """
-"""A script for four virtual devices, each of which simulates two of eight scenes of one object."""
+"""A script for four virtual devices, each of which simulates two of eight falling objects."""
 
 
 @pytest.fixture(scope="session")
@@ -209,7 +210,7 @@ def test_a_fence_pushes_as_in_mujoco_c(
     assert np.abs(far - wanted.poses[:, 0])[..., 0].max() > 0.02
 
 
-def test_a_batch_is_shared_by_all_devices_with_equal_results(tmp_path: pathlib.Path) -> None:
+def test_a_batch_is_shared_by_all_devices_and_each_scene_comes_back_in_its_place(tmp_path: pathlib.Path) -> None:
     script = tmp_path / "devices.py"
     script.write_text(FOUR_DEVICES)
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}

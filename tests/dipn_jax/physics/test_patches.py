@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 import pytest
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver, solver
@@ -40,28 +39,20 @@ def unpatched(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(table, types, getattr(table[types], "upstream", table[types]))
 
 
-def _stepped(steps: int) -> Any:
-    """Return positions, velocities and contacts of the foreign model after some steps, in a newly traced program."""
+def _program() -> str:
+    """Return the program of a step of the foreign model, newly traced."""
     m = mjx.put_model(mujoco.MjModel.from_xml_string(FOREIGN), impl="jax")
-    step = jax.jit(lambda d: mjx.step(m, d))
-    d = mjx.make_data(m).replace(qvel=jnp.full(12, 0.3))
     with jax.numpy_rank_promotion("allow"):
-        for _ in range(steps):
-            d = step(d)
-    contact = d._impl.contact
-    return jax.device_get((d.qpos, d.qvel, contact.dist, contact.pos, contact.frame, d._impl.efc_force))
+        return jax.jit(lambda d: mjx.step(m, d)).lower(mjx.make_data(m)).as_text()
 
 
 @pytest.mark.usefixtures("unpatched")
 def test_a_foreign_model_steps_as_if_there_were_no_engine() -> None:
     untouched = solver.solve
-    before = _stepped(30)
+    before = _program()
     MjxEngine()
     assert solver.solve is not untouched
-    after = _stepped(30)
-    assert (before[2] < 0).any() and (before[-1] != 0).any(), "there are contacts, and they push"
-    for a, b in zip(before, after, strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert _program() == before
 
 
 @pytest.mark.usefixtures("unpatched")
