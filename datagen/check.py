@@ -17,6 +17,7 @@ from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
 from dipn_jax.seeds import Purpose
+from dipn_jax.storage import owner
 from dipn_jax.structs import Fault
 from dipn_jax.world import shapes
 
@@ -49,9 +50,15 @@ def run(out: pathlib.Path, config: CheckConfig, *, threads: int | None = None) -
     """Measure, and write `metrics.json` and `world.md`; sections already measured with this config are not repeated.
 
     Raises:
-      UserError: an engine cannot run here, or the folder belongs to another config.
+      UserError: an engine cannot run here, the folder belongs to another config, or another process has it.
     """
     console.require_out(out)
+    with owner.owned(out):
+        _measure(out, config, threads)
+
+
+def _measure(out: pathlib.Path, config: CheckConfig, threads: int | None) -> None:
+    """Measure in a folder that this process owns; arguments as of `run`."""
     engines = {}
     for name in config.engines:
         variant = world.ENGINES[name]

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import logging
+import os
 import pathlib
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -263,6 +264,8 @@ class _Log:
     def write(self, step: int, values: dict[str, float]) -> None:
         with self.path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps({"step": step, **values}, allow_nan=False) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())  # before the step that it belongs to is saved
         for name, value in values.items():
             self.events.add_scalar(name, value, step)
 

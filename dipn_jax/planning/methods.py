@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float, Int, Key
 
+from dipn_jax import forking
 from dipn_jax.errors import UserError
 from dipn_jax.names import ALL_AIDS, Aid, MethodName
 from dipn_jax.networks import vpg
@@ -57,9 +58,11 @@ class Policy:
           missed: grasps (rotation, row, col) that missed on this table as it is.
 
         Raises:
-          UserError: the observation is none of those that `dipn_jax.check_observation` lets through.
+          UserError: the observation is none of those that `dipn_jax.check_observation` lets through, or this process
+            was forked after JAX had been used.
         """
         if not observed.is_traced(observation):
+            forking.check()
             observed.check_observation(observation)
         return self.act(key, observation, missed, self.rule, self.distances)
 

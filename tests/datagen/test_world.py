@@ -11,6 +11,7 @@ from dipn_jax.datagen import check, episodes, isolated, world
 
 from dipn_jax import files, geometry
 from dipn_jax.errors import UserError
+from dipn_jax.storage import owner
 from dipn_jax.world import shapes
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
@@ -82,3 +83,8 @@ def test_the_page_in_docs_shows_the_figures_in_docs() -> None:
     page = (DOCS / "world.md").read_text()
     assert [block for block in blocks if f"\n\n{block}\n" not in page] == []
     assert min(v for k, v in metrics.items() if k.startswith("grasp_isolated/")) >= 0.98
+
+
+def test_a_second_measurement_into_a_folder_is_told_who_has_it(tmp_path: pathlib.Path) -> None:
+    with owner.owned(tmp_path / "out"), pytest.raises(UserError, match="out: in use by host "):
+        check.run(tmp_path / "out", check.CheckConfig((), scenes=1, few=1, tries=1, seed=0))

@@ -37,6 +37,9 @@ def drop(i):
 def load(i):
     dipn_jax.load_network(network="grasp")
 
+def act(i):
+    POLICY(np.zeros(2, np.uint32), OBSERVATION)
+
 def said(task):
     try:
         return f"no error but {task[0](task[1])}"
@@ -51,9 +54,10 @@ if __name__ == "__main__":
         early = pool.apply(render, [1])
     here = render(1)
     assert xla_bridge._backends and early == here
+    POLICY, OBSERVATION = dipn_jax.load_policy("gn"), None  # what the parent has loaded
     with fork.Pool(2) as pool:
         assert pool.map(read, range(3)) == wanted
-        for name in (render, push, drop, load):
+        for name in (render, push, drop, load, act):
             found = pool.map_async(said, [(name, 0)]).get(60)
             assert "was forked after JAX had been used" in found[0] and "spawn" in found[0], (name, found)
     with spawn.Pool(1) as pool:
