@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from dipn_jax.datagen.generate import Job, generate
-from dipn_jax.train.loop import TrainConfig, make_optimizer, make_step
+from dipn_jax.train.loop import TrainConfig, make_step
+from dipn_jax.train.optimizers import make_optimizer
 from dipn_jax.train.push import PushTask
 from flax import nnx
 

@@ -11,7 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 from dipn_jax.train.cli import PUSH
-from dipn_jax.train.loop import make_optimizer, make_step
+from dipn_jax.train.loop import make_step
+from dipn_jax.train.optimizers import make_optimizer
 from flax import nnx
 
 from benchmarks.harness import Setting, seconds

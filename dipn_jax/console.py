@@ -55,14 +55,14 @@ def enable_compilation_cache() -> None:
 
 
 class Progress:
-    """A progress bar on a terminal, a line every few seconds in a log. Use it as a context manager."""
+    """A progress bar on a terminal, a line every few seconds in a log; nothing if `quiet`. It is a context manager."""
 
-    def __init__(self, title: str, total: int, *, unit: str, done: int = 0) -> None:
-        self.title, self.total, self.unit = title, total, unit
+    def __init__(self, title: str, total: int, *, unit: str, done: int = 0, quiet: bool = False) -> None:
+        self.title, self.total, self.unit, self.quiet = title, total, unit, quiet
         self.done, self.begun_at = done, done
         self.note = ""
         self._bar: rich.progress.Progress | None = None
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and not quiet:
             import rich.progress
 
             self._bar = rich.progress.Progress(
@@ -89,7 +89,7 @@ class Progress:
     ) -> None:
         if self._bar:
             self._bar.stop()
-        elif kind is None:
+        elif kind is None and not self.quiet:
             self._line()
 
     def advance(self, amount: int, note: str = "") -> None:
@@ -100,7 +100,7 @@ class Progress:
             if self._bar:
                 rate = f"{self._rate():.1f} {self.unit}/s"
                 self._bar.update(self._task, completed=self.done, rate=rate, note=note)
-            elif time.monotonic() - self._logged > LOG_PERIOD:
+            elif time.monotonic() - self._logged > LOG_PERIOD and not self.quiet:
                 self._line()
 
     def _rate(self) -> float:

@@ -32,7 +32,8 @@ from . import acting, finite, tables
 from .acting import Look
 from .configs import BaselineConfig
 from .grasp import GRASP_MIRRORS, PUSH_MIRRORS, SHIFT_PIXELS, WINDOW_PIXELS, Window, executed, windows
-from .loop import constant_adamw, make_step
+from .loop import make_step
+from .optimizers import constant_adamw
 from .rounds import Run
 
 LEARNT_PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}

@@ -11,7 +11,7 @@ import tyro
 from dipn_jax import console
 
 from .acting_commands import baseline, grasp_online, say
-from .configs import Preset, ShapeClass, TrainConfig
+from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -26,10 +26,20 @@ GRASP = TrainConfig(steps=800, eval_every=250, save_every=250)
 """How `grasp` trains unless told otherwise."""
 
 
-def _fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Module | None = None) -> None:
+def _fit(
+    task: Task, config: TrainConfig, out: pathlib.Path, compute: Compute, *, initial: nnx.Module | None = None
+) -> None:
     from .loop import fit
 
-    say(out, fit(task, config, out, initial=initial), digits=".4g")
+    say(out, fit(task, config, out, initial=initial, compute=compute), digits=".4g")
+
+
+def _join(compute: Compute) -> None:
+    """Join the other processes of the job, before JAX is used."""
+    if compute.data_parallel or compute.coordinator or compute.processes != 1:
+        from . import devices
+
+        devices.join(compute)
 
 
 def _initial(init: pathlib.Path | None, network: str) -> Any:
@@ -49,6 +59,7 @@ def push(
     without: tuple[ShapeClass, ...] = (),
     masks: Literal["true", "found"] = "true",
     config: TrainConfig = PUSH,
+    compute: Compute = DEFAULT_COMPUTE,
 ) -> None:
     """Train DIPN on push episodes; one network for every push distance.
 
@@ -69,7 +80,9 @@ def push(
       without: leave out scenes with an object of these classes, to see how well unseen shapes are predicted.
       masks: true: the simulator's; found: cut out of the rendered image by colour and height.
       config: optimizer and schedule.
+      compute: how steps are computed.
     """
+    _join(compute)
     from dipn_jax.networks.dipn import DipnConfig
 
     from .push import PushTask
@@ -77,7 +90,7 @@ def push(
     found, initial = masks == "found", _initial(init, "dipn")
     network = initial.config if initial else DipnConfig(preset=preset)
     task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found)
-    _fit(task, config, out, initial=initial)
+    _fit(task, config, out, compute, initial=initial)
 
 
 def grasp_pretrain(
@@ -86,6 +99,7 @@ def grasp_pretrain(
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
     config: TrainConfig = GRASP_PRETRAIN,
+    compute: Compute = DEFAULT_COMPUTE,
 ) -> None:
     """Train GN on images alone: a pixel is positive where the fingers fit around something.
 
@@ -98,14 +112,16 @@ def grasp_pretrain(
       init: run to start from, or builtin; its architecture is used.
       preset: architecture, without --init.
       config: optimizer and schedule; an example is a view.
+      compute: how steps are computed.
     """
+    _join(compute)
     from dipn_jax.networks.grasp import GraspConfig
 
     from .grasp import PretrainTask
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    _fit(PretrainTask(data, network), config, out, initial=initial)
+    _fit(PretrainTask(data, network), config, out, compute, initial=initial)
 
 
 def grasp(
@@ -114,6 +130,7 @@ def grasp(
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
     config: TrainConfig = GRASP,
+    compute: Compute = DEFAULT_COMPUTE,
 ) -> None:
     """Train GN on the outcomes of executed grasps; the loss is at the executed pixel only.
 
@@ -126,14 +143,16 @@ def grasp(
       init: run to start from (grasp-pretrain's), or builtin; its architecture is used.
       preset: architecture, without --init.
       config: optimizer and schedule; an example is a grasp.
+      compute: how steps are computed.
     """
+    _join(compute)
     from dipn_jax.networks.grasp import GraspConfig
 
     from .grasp import GraspTask
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    _fit(GraspTask(data, network), config, out, initial=initial)
+    _fit(GraspTask(data, network), config, out, compute, initial=initial)
 
 
 def export(

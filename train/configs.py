@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 from typing import Literal
 
 import tyro
@@ -36,6 +37,34 @@ class TrainConfig:
     """Steps between points of the learning curve."""
     save_every: int = 200
     """Steps between checkpoints."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Compute:
+    """How steps are computed."""
+
+    data_parallel: bool = False
+    """Share each batch among all devices: of this machine, or of all processes of the job. What is learnt is the same
+    but for rounding, and a run may go on with another number of devices."""
+    accumulate: int = 1
+    """Parts that each batch is computed in, one after another, for less memory. The gradient is the mean of theirs, and
+    each has its own statistics and random numbers."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Precision of what the network's layers compute; weights, statistics and losses stay float32."""
+    compile_only: bool = False
+    """Compile a step, say what memory it needs, and write nothing but the compiled program that JAX keeps."""
+    profile: pathlib.Path | None = None
+    """Folder for a profile of ten steps, for TensorBoard or Perfetto."""
+    coordinator: str = ""
+    """HOST:PORT of process 0 of a job of several; SLURM, Open MPI and Kubernetes tell it themselves."""
+    processes: int = 1
+    """Number of processes of the job, with --coordinator."""
+    process: int = 0
+    """Which of them this one is, counted from 0, with --coordinator."""
+
+
+DEFAULT_COMPUTE = Compute()
+"""One device, whole batches, single precision."""
 
 
 @dataclasses.dataclass(frozen=True)

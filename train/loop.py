@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
-import json
 import logging
-import os
 import pathlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
-import tensorboardX
 from flax import nnx
 
-from dipn_jax import console, files, seeds, typed
+from dipn_jax import console, files, seeds
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner, saving
 
-from . import finite
-from .configs import BaselineConfig, OnlineConfig, TrainConfig
+from . import devices, finite, log, precision, profiling
+from .configs import DEFAULT_COMPUTE, Compute, TrainConfig
+from .optimizers import make_optimizer
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
 import grain  # noqa: E402
-
-LONGEST_RISE = 1000
-"""Steps that the rate of `published_rate` rises at most. Source: DIPN's released code."""
 
 
 class Taught(Protocol):
@@ -58,67 +55,69 @@ class Task(Taught, Protocol):
         ...
 
 
-def published_rate(config: TrainConfig, *, examples: int) -> optax.Schedule:
-    """Return the learning rate of a step as DIPN's released code plans it.
-
-    It rises from a thousandth during the first epoch (or LONGEST_RISE steps), and falls to a tenth after each third of
-    the run. That code compares whole epochs with thirds, so that there it falls only if their number is a multiple of
-    three, which the 50 of its README is not; the thirds are our reading.
-    """
-    rise = min(LONGEST_RISE, max(1, -(-examples // config.batch) - 1))
-    thirds = {-(-k * config.steps // 3): 0.1 for k in (1, 2)}
-    risen = optax.linear_schedule(config.learning_rate / 1000, config.learning_rate, rise)
-    fallen = optax.piecewise_constant_schedule(1.0, thirds)
-    return lambda step: risen(step) * fallen(step)
-
-
-def make_optimizer(config: TrainConfig, *, examples: int = 0) -> optax.GradientTransformation:
-    """Return the optimizer of a run on this number of examples, with its schedule."""
-    if config.optimizer in ("sgd", "published"):
-        constant = config.optimizer == "sgd"
-        rate = config.learning_rate if constant else published_rate(config, examples=examples)
-        return optax.chain(optax.add_decayed_weights(config.weight_decay), optax.sgd(rate, momentum=0.9))
-    if config.optimizer == "adamw":
-        warm = min(100, config.steps // 10 + 1)
-        rate = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warm, max(config.steps, warm + 1))
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=config.weight_decay))
-    raise UserError(f"--optimizer {config.optimizer}: want adamw, sgd or published")
-
-
-def constant_adamw(config: OnlineConfig | BaselineConfig) -> optax.GradientTransformation:
-    """The optimizer of a run that learns while it acts: AdamW with a constant rate."""
-    adamw = optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
-    return optax.chain(optax.clip_by_global_norm(1.0), adamw)
-
-
 def _split(model: nnx.Module) -> tuple[Any, Any, Any]:
     """Split a network into its graph, its parameters and everything else (statistics, random streams)."""
     parts: Any = nnx.split(model, nnx.Param, ...)
     return parts
 
 
-def make_step(task: Taught, graph: Any, optimizer: optax.GradientTransformation) -> Callable[..., Any]:
+def make_step(
+    task: Taught, graph: Any, optimizer: optax.GradientTransformation, *, compute: Compute = DEFAULT_COMPUTE
+) -> Callable[..., Any]:
     """Return the jitted step `(params, rest, moments, batch, key) -> (params, rest, moments, loss)`.
 
     The first three arguments are donated.
     """
 
-    @functools.partial(jax.jit, donate_argnums=(0, 1, 2))
-    def step(params: Any, rest: Any, moments: Any, batch: Any, key: jax.Array) -> Any:
+    def gradient(params: Any, rest: Any, batch: Any, key: jax.Array) -> tuple[jax.Array, Any, Any]:
         def loss(p: Any) -> tuple[jax.Array, Any]:
             model = nnx.merge(graph, p, rest, copy=True)  # variables of this trace, which may be written
             model.train()
+            precision.compute_in(model, compute.precision)
             value = task.loss(model, batch, key)
             return value, _split(model)[2]
 
-        (value, new_rest), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-        updates, moments = optimizer.update(gradient, moments, params)
-        return optax.apply_updates(params, updates), new_rest, moments, value
+        (value, new_rest), slope = jax.value_and_grad(loss, has_aux=True)(params)
+        return value, new_rest, slope
+
+    @functools.partial(jax.jit, donate_argnums=(0, 1, 2))
+    def step(params: Any, rest: Any, moments: Any, batch: Any, key: jax.Array) -> Any:
+        if compute.accumulate == 1:
+            value, rest, slope = gradient(params, rest, batch, key)
+        else:
+            value, rest, slope = _accumulated(functools.partial(gradient, params), rest, batch, key, compute.accumulate)
+        updates, moments = optimizer.update(slope, moments, params)
+        return optax.apply_updates(params, updates), rest, moments, value
 
     return step
 
 
-def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Module | None = None) -> dict[str, float]:
+def _accumulated(gradient: Callable[..., Any], rest: Any, batch: Any, key: jax.Array, parts: int) -> Any:
+    """Return what `gradient(rest, batch, key)` does, as means over parts of the batch that are computed in turn.
+
+    A part has every `parts`-th example, so that devices that share the batch share each part.
+    """
+    split = jax.tree.map(lambda leaf: leaf.reshape(-1, parts, *leaf.shape[1:]).swapaxes(0, 1), batch)
+
+    def one(carry: Any, given: tuple[Any, jax.Array]) -> tuple[Any, None]:
+        value, rest, slope = gradient(carry[1], *given)
+        both = jax.tree.map(lambda total, part: total + part / parts, (carry[0], carry[2]), (value, slope))
+        return (both[0], rest, both[1]), None
+
+    first = jax.tree.map(lambda leaf: leaf[0], split)
+    shapes = jax.eval_shape(gradient, rest, first, key)
+    value, slope = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), (shapes[0], shapes[2]))
+    return jax.lax.scan(one, (value, rest, slope), (split, jax.random.split(key, parts)))[0]
+
+
+def fit(
+    task: Task,
+    config: TrainConfig,
+    out: pathlib.Path,
+    *,
+    initial: nnx.Module | None = None,
+    compute: Compute = DEFAULT_COMPUTE,
+) -> dict[str, float]:
     """Train, or continue to train, in the folder `out`.
 
     Args:
@@ -126,18 +125,22 @@ def fit(task: Task, config: TrainConfig, out: pathlib.Path, *, initial: nnx.Modu
       config: how.
       out: run folder: `config.json`, `metrics.jsonl`, `events/` (TensorBoard), `checkpoints/`.
       initial: network to start from; a fresh one if not given.
+      compute: how steps are computed. Several processes call this with the same arguments; one of them writes.
 
     Returns:
-      The last evaluation.
+      The last evaluation; with `compute.compile_only` the memory that a step needs, in MB.
 
     Raises:
       UserError: the folder holds a run of another config or on other data, or another process has it; or a loss or
         a weight is not finite, after which nothing is saved.
     """
-    _check(config, out)
+    _check(config, compute, out)
+    where = devices.placement(compute, batch=config.batch)
     optimizer = make_optimizer(config, examples=task.size)
-    with owner.owned(out):
-        return _fit(task, config, out, optimizer, initial)
+    if compute.compile_only:
+        return _compile(task, config, optimizer, initial, compute, where)
+    with owner.owned(out) if where.leads else contextlib.nullcontext():
+        return _fit(task, config, out, optimizer, initial, compute, where)
 
 
 def _fit(
@@ -146,53 +149,82 @@ def _fit(
     out: pathlib.Path,
     optimizer: optax.GradientTransformation,
     initial: nnx.Module | None,
+    compute: Compute,
+    where: devices.OneDevice,
 ) -> dict[str, float]:
-    """Train in a folder that this process owns; arguments as of `fit`."""
+    """Train in a folder that this process owns, or its leader; arguments as of `fit`."""
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
-    _claim(out, _identity(task, config, initial), config)
+    if where.leads:
+        _claim(out, _identity(task, config, compute, initial), config)
+    where.wait("claimed")
     moments, begin = _resume(out, model, optimizer)
-    graph, params, rest = _split(model)
+    graph, *state = _split(model)
+    params, rest, moments = where.everywhere((*state, moments))
     order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
-    step_fn = make_step(task, graph, optimizer)
-    log = _Log(out, begin)
+    step_fn = make_step(task, graph, optimizer, compute=compute)
+    curve = log.Log(out, begin, batch=config.batch, writes=where.leads)
     key = seeds.key(config.seed, seeds.Purpose.TRAINING)
     latest: dict[str, float] = {}
     watch = finite.Watch(config.learning_rate, lambda k: np.asarray(order[k]), "the last finite checkpoint is kept")
 
     def save(step: int) -> None:
-        parts = {"model": nnx.state(nnx.merge(graph, params, rest)), "train": moments}
+        here = where.here((params, rest))
+        parts = {"model": nnx.state(nnx.merge(graph, *here)), "train": where.here(moments)}
         about = {"seed": config.seed, "data": task.fingerprint, "examples": task.examples, **latest}
-        saver.save(step, parts, extra=about)
+        if where.leads:
+            saver.save(step, parts, extra=about)
 
     step, saver = begin, saving.Saver(out, network=task.network, config=task.network_config)
-    progress = console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin)
-    with progress, Interruption() as interruption, saver:
+    progress = console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin, quiet=not where.leads)
+    profiled = profiling.Profiler(compute.profile if where.leads else None, begin)
+    with progress, Interruption() as interruption, saver, profiled:
         while step < config.steps:
-            batch = task.fetch(np.asarray(order[step]))
+            profiled.see(step)
+            batch = where.share(task.fetch(where.rows(np.asarray(order[step]))))
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
-            watch.see(step, loss)
+            watch.see(step, where.here(loss))
             step += 1
+            stopping = where.any_says(interruption.requested, step)
             evaluating = step % config.eval_every == 0 or step == config.steps
-            due = step % config.save_every == 0 or step == config.steps or interruption.requested
+            due = step % config.save_every == 0 or step == config.steps or stopping
             if evaluating or due:
-                watch.check(step, (params, rest, moments))
+                watch.check(step, where.here((params, rest, moments)))
             if evaluating:
-                model = nnx.merge(graph, params, rest)
+                model = nnx.merge(graph, *where.here((params, rest)))
                 model.eval()
-                latest = {"loss": float(loss), **task.evaluate(model)}
-                watch.check(step, params, **latest)
-                log.write(step, latest)
-            if due or interruption.requested:
+                latest = {"loss": float(where.here(loss)), **task.evaluate(model)}
+                watch.check(step, where.here(params), **latest)
+                curve.write(step, latest)
+            if due:
                 save(step)
-            if interruption.requested:
+            if stopping:
                 saver.wait()
                 raise KeyboardInterrupt
             progress.advance(1, " ".join(f"{k} {v:.3f}" for k, v in latest.items()))
-    log.close()
-    return latest or log.last()
+    where.wait("done")
+    curve.close()
+    return latest or log.last(out)
 
 
-def _check(config: TrainConfig, out: pathlib.Path) -> None:
+def _compile(
+    task: Task,
+    config: TrainConfig,
+    optimizer: optax.GradientTransformation,
+    initial: nnx.Module | None,
+    compute: Compute,
+    where: devices.OneDevice,
+) -> dict[str, float]:
+    """Compile a step and return the memory in MB that XLA plans on each device; arguments as of `fit`."""
+    graph, *state = _split(initial or checkpoint.build(task.network, task.network_config, seed=config.seed))
+    given = where.everywhere((*state, optimizer.init(state[0])))
+    batch = where.share(task.fetch(where.rows(np.arange(config.batch) % task.size)))
+    step: Any = make_step(task, graph, optimizer, compute=compute)
+    planned = step.lower(*given, batch, jax.random.key(0)).compile().memory_analysis()
+    sizes = {"arguments": planned.argument_size_in_bytes, "temporary": planned.temp_size_in_bytes}
+    return {f"{name}_mb": size / 1e6 for name, size in sizes.items()}
+
+
+def _check(config: TrainConfig, compute: Compute, out: pathlib.Path) -> None:
     """Raise UserError where an option is out of its range or `out` cannot be written."""
     console.require_positive(
         steps=config.steps,
@@ -200,7 +232,12 @@ def _check(config: TrainConfig, out: pathlib.Path) -> None:
         learning_rate=config.learning_rate,
         eval_every=config.eval_every,
         save_every=config.save_every,
+        accumulate=compute.accumulate,
     )
+    if config.batch % compute.accumulate:
+        raise UserError(
+            f"--batch {config.batch} --accumulate {compute.accumulate}: want a number that divides the batch"
+        )
     console.require_between(0, 1, weight_decay=config.weight_decay)
     console.require_seed(config.seed)
     console.require_out(out)
@@ -217,12 +254,14 @@ def _resume(out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTrans
     return checkpoint.restore(folder, "train", moments), int(meta["step"])
 
 
-def _identity(task: Task, config: TrainConfig, initial: nnx.Module | None) -> dict[str, Any]:
+def _identity(task: Task, config: TrainConfig, compute: Compute, initial: nnx.Module | None) -> dict[str, Any]:
     """Return everything that determines the run; a flat dictionary, so that a difference can be named."""
+    learnt = {name: getattr(compute, name) for name in ("accumulate", "precision")}
+    unusual = {name: value for name, value in learnt.items() if value != getattr(DEFAULT_COMPUTE, name)}
     start = None if initial is None else checkpoint.digest(initial)
     network = {f"network.{k}": v for k, v in dataclasses.asdict(task.network_config).items()}
     data = {"network": task.network, "initial_weights": start, "data": task.fingerprint}
-    return {**data, **network, **dataclasses.asdict(config)}
+    return {**data, **network, **dataclasses.asdict(config), **unusual}
 
 
 def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> None:
@@ -241,37 +280,3 @@ def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> 
             f"{out}: its learning rate is planned for --steps {begun}, so that it cannot go on to {config.steps}; give "
             f"--init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
         )
-
-
-def _step_of(line: str) -> float:
-    """Return the step of a line of `metrics.jsonl`; infinite if a hard stop cut the line."""
-    try:
-        return float(typed.check(typed.parse(line), {"step": float})["step"])
-    except typed.Misfit:
-        return float("inf")
-
-
-class _Log:
-    """Writer of `metrics.jsonl` and TensorBoard events; lines past the restored step are dropped."""
-
-    def __init__(self, out: pathlib.Path, begin: int) -> None:
-        self.path = out / "metrics.jsonl"
-        old = files.read_text(self.path).splitlines() if self.path.exists() else []
-        kept = [line for line in old if _step_of(line) <= begin]
-        files.write_text(self.path, "".join(line + "\n" for line in kept))
-        self.events = tensorboardX.SummaryWriter(str(out / "events"), purge_step=begin)
-
-    def write(self, step: int, values: dict[str, float]) -> None:
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps({"step": step, **values}, allow_nan=False) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())  # before the step that it belongs to is saved
-        for name, value in values.items():
-            self.events.add_scalar(name, value, step)
-
-    def last(self) -> dict[str, float]:
-        lines = files.read_lines(self.path)
-        return lines[-1] if lines else {}
-
-    def close(self) -> None:
-        self.events.close()

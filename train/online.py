@@ -28,7 +28,8 @@ from dipn_jax.world.scenes import SceneConfig
 from . import finite, tables
 from .configs import OnlineConfig
 from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
-from .loop import constant_adamw, make_step
+from .loop import make_step
+from .optimizers import constant_adamw
 from .rounds import Run
 from .tables import Tables
 

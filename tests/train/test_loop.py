@@ -10,7 +10,8 @@ import pytest
 from dipn_jax.train import grasp as grasp_task
 from dipn_jax.train import online, rounds
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
-from dipn_jax.train.loop import TrainConfig, fit, make_optimizer, make_step
+from dipn_jax.train.loop import TrainConfig, fit, make_step
+from dipn_jax.train.optimizers import make_optimizer
 from dipn_jax.train.push import PushTask
 from flax import nnx
 

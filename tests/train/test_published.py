@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from dipn_jax.train import cli, push
 from dipn_jax.train.configs import TrainConfig
-from dipn_jax.train.loop import make_optimizer, published_rate
+from dipn_jax.train.optimizers import make_optimizer, published_rate
 from flax import nnx
 
 from dipn_jax import console

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dipn_jax.train import loop
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.loop import TrainConfig, fit
 from dipn_jax.train.push import PushTask
@@ -120,6 +119,6 @@ def test_an_interrupted_run_says_that_its_last_step_cannot_be_saved(
 def test_a_line_of_the_log_that_was_cut_or_damaged_is_dropped(tmp_path: pathlib.Path) -> None:
     good = '{"step": 2, "loss": 0.5}'
     (tmp_path / "metrics.jsonl").write_text("\n".join([good, "[" * 100_000, '{"step": "3"}', '{"step": 4, "lo']))
-    log = loop._Log(tmp_path, 3)
-    assert (tmp_path / "metrics.jsonl").read_text() == good + "\n" and log.last() == {"step": 2, "loss": 0.5}
-    log.close()
+    curve = log.Log(tmp_path, 3, batch=4)
+    assert (tmp_path / "metrics.jsonl").read_text() == good + "\n" and log.last(tmp_path) == {"step": 2, "loss": 0.5}
+    curve.close()

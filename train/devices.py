@@ -1,0 +1,135 @@
+"""Where training steps are computed: on one device, or each batch shared by all devices of a machine or of a job."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from dipn_jax.errors import UserError
+
+from .configs import Compute
+
+SYNC_EVERY = 10
+"""Steps after which the processes of a job ask one another whether one of them has been interrupted."""
+
+
+class OneDevice:
+    """Steps on the device that JAX takes unless told otherwise."""
+
+    leads = True
+    """Whether this process writes the run's folder, and says how far it is."""
+
+    def rows(self, batch: np.ndarray) -> np.ndarray:
+        """Return those examples of a batch `[B]` that this process fetches."""
+        return batch
+
+    def share(self, examples: Any) -> Any:
+        """Return a batch, of which this process gives the examples of `rows`, as it is given to a step."""
+        return examples
+
+    def everywhere(self, tree: Any) -> Any:
+        """Return a pytree of which every device has all."""
+        return tree
+
+    def here(self, tree: Any) -> Any:
+        """Return a pytree that is the same everywhere as arrays of one device of this process."""
+        return tree
+
+    def any_says(self, said: bool, step: int) -> bool:
+        """Return whether a process says so; asked after every step, by all processes, answered after some."""
+        return said
+
+    def wait(self, name: str) -> None:
+        """Wait until all processes are at the place `name`."""
+
+
+class Shared(OneDevice):
+    """Steps whose batches are shared by several devices, each of which has all parameters.
+
+    XLA adds what they find, so a loss or a statistic of a batch is that of the whole batch.
+    """
+
+    def __init__(self, devices: Sequence[jax.Device], *, batch: int) -> None:
+        """Prepare to share batches of `batch` examples.
+
+        Raises:
+          UserError: they cannot be shared equally.
+        """
+        if batch % len(devices):
+            raise UserError(
+                f"--batch {batch} --data-parallel: {len(devices)} devices share a batch; want a multiple of that"
+            )
+        mesh = jax.sharding.Mesh(np.asarray(devices), ("examples",))
+        self._each = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("examples"))
+        self._all = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+        self.leads = jax.process_index() == 0
+
+    def rows(self, batch: np.ndarray) -> np.ndarray:
+        """See `OneDevice`."""
+        return np.array_split(batch, jax.process_count())[jax.process_index()]
+
+    def share(self, examples: Any) -> Any:
+        """See `OneDevice`."""
+        return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(self._each, np.asarray(leaf)), examples)
+
+    def everywhere(self, tree: Any) -> Any:
+        """See `OneDevice`."""
+        return jax.device_put(tree, self._all)
+
+    def here(self, tree: Any) -> Any:
+        """See `OneDevice`."""
+        return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
+
+    def any_says(self, said: bool, step: int) -> bool:
+        """See `OneDevice`."""
+        if jax.process_count() == 1:
+            return said
+        return step % SYNC_EVERY == 0 and bool(multihost_utils.process_allgather(np.asarray(said)).any())
+
+    def wait(self, name: str) -> None:
+        """See `OneDevice`."""
+        if jax.process_count() > 1:
+            multihost_utils.sync_global_devices(name)
+
+
+def placement(compute: Compute, *, batch: int) -> OneDevice:
+    """Return where the steps on batches of `batch` examples are computed.
+
+    Raises:
+      UserError: the devices cannot share a batch equally.
+    """
+    return Shared(jax.devices(), batch=batch) if compute.data_parallel else OneDevice()
+
+
+def join(compute: Compute) -> None:
+    """Join the other processes of the job, where there are any; before anything else is asked of JAX.
+
+    SLURM and Open MPI tell JAX of them, and so does Kubernetes where the package `kubernetes` is installed; elsewhere
+    options do.
+
+    Raises:
+      UserError: the options do not say who this process is.
+    """
+    if compute.coordinator:
+        if not 0 <= compute.process < compute.processes:
+            raise UserError(
+                f"--processes {compute.processes} --process {compute.process}: want the number of processes, and which "
+                "of them this one is, counted from 0"
+            )
+        jax.distributed.initialize(compute.coordinator, compute.processes, compute.process)
+    elif compute.processes != 1 or compute.process != 0:
+        raise UserError(f"--processes {compute.processes}: needs --coordinator HOST:PORT, the address of process 0")
+    elif _started_as_several():
+        jax.distributed.initialize()
+
+
+def _started_as_several() -> bool:
+    """Return whether a job manager has started this process as one of several."""
+    counts = [os.environ.get(name, "1") for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")]
+    indexed = "KUBERNETES_SERVICE_HOST" in os.environ and "JOB_COMPLETION_INDEX" in os.environ
+    return indexed or any(count.isdecimal() and int(count) > 1 for count in counts)

@@ -1,0 +1,72 @@
+"""The learning curve of a run: `metrics.jsonl` and TensorBoard events."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import resource
+import time
+
+import jax
+import tensorboardX
+
+from dipn_jax import files, typed
+
+
+def last(out: pathlib.Path) -> dict[str, float]:
+    """Return the last line of a run's `metrics.jsonl`; empty where there is none."""
+    lines = files.read_lines(out / "metrics.jsonl")
+    return lines[-1] if lines else {}
+
+
+def _step_of(line: str) -> float:
+    """Return the step of a line of `metrics.jsonl`; infinite if a hard stop cut the line."""
+    try:
+        return float(typed.check(typed.parse(line), {"step": float})["step"])
+    except typed.Misfit:
+        return float("inf")
+
+
+class Log:
+    """Writer of a run's learning curve; lines past the restored step are dropped.
+
+    TensorBoard also gets examples a second since the point before, and the most memory in MB that was needed so far:
+    of the device, or of the process where the device is a CPU.
+    """
+
+    def __init__(self, out: pathlib.Path, begin: int, *, batch: int, writes: bool = True) -> None:
+        """Open the files of a run that goes on after step `begin`, if this process `writes` them."""
+        self.path, self._batch, self._at = out / "metrics.jsonl", batch, (begin, time.monotonic())
+        self._events: tensorboardX.SummaryWriter | None = None
+        if writes:
+            old = files.read_text(self.path).splitlines() if self.path.exists() else []
+            kept = [line for line in old if _step_of(line) <= begin]
+            files.write_text(self.path, "".join(line + "\n" for line in kept))
+            self._events = tensorboardX.SummaryWriter(str(out / "events"), purge_step=begin)
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        """Write a point of the curve, and wait until it is on the disk."""
+        if self._events is None:
+            return
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps({"step": step, **values}, allow_nan=False) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())  # before the step that it belongs to is saved
+        (before, then), now = self._at, time.monotonic()
+        self._at = step, now
+        speed = {"examples_per_s": (step - before) * self._batch / max(now - then, 1e-9), "peak_memory_mb": _peak()}
+        for name, value in (values | speed).items():
+            self._events.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Write what is left and close the files."""
+        if self._events:
+            self._events.close()
+
+
+def _peak() -> float:
+    found = jax.local_devices()[0].memory_stats()
+    if found and "peak_bytes_in_use" in found:
+        return float(found["peak_bytes_in_use"]) / 1e6
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

@@ -1,0 +1,23 @@
+"""The precision that a network's layers compute in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from flax import nnx
+
+
+def compute_in(model: nnx.Module, precision: str) -> None:
+    """Make every layer of a network that has weights compute in a precision; the weights stay as they are.
+
+    Args:
+      model: the network; it is changed.
+      precision: float32 leaves it alone; or bfloat16, whose sums and statistics Flax keeps in float32.
+    """
+    if precision == "float32":
+        return
+    for _, node in nnx.iter_graph(model):
+        layer: Any = node
+        if isinstance(node, nnx.Module) and hasattr(node, "param_dtype"):
+            layer.dtype = jnp.bfloat16
