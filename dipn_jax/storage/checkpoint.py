@@ -96,7 +96,7 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
       UserError: there is no space for it.
     """
     folder.mkdir(parents=True)
-    checkpointer = ocp.StandardCheckpointer()
+    checkpointer = ocp.StandardCheckpointer(multiprocessing_options=stored_step.alone())
     try:
         with quiet.failing():  # what Orbax prints is said in one line below
             for name, tree in parts.items():

@@ -8,6 +8,7 @@ import pathlib
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -74,6 +75,19 @@ def require_room(part: pathlib.Path, config: Any) -> None:
                 raise UserError(f"checkpoint {part}: its config is of a larger network than its arrays; train again")
 
 
+def alone() -> ocp.options.MultiprocessingOptions:
+    """Return Orbax's options for a process that reads or writes by itself, whatever the others of its job do."""
+    me = jax.process_index()
+    return ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"
+    )
+
+
+def _reader() -> ocp.Checkpointer:
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone())
+    return ocp.Checkpointer(handler, multiprocessing_options=alone())
+
+
 def arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
     """Return the arrays of one Orbax folder by their path in the tree, whatever devices saved them.
 
@@ -82,14 +96,14 @@ def arrays(part: pathlib.Path) -> dict[str, np.ndarray]:
     """
     as_numpy = {key: ocp.RestoreArgs(restore_type=np.ndarray) for key in _stored(part)}
     with _reading(part):
-        restored: dict[str, np.ndarray] = ocp.PyTreeCheckpointer().restore(part, restore_args=as_numpy)
+        restored: dict[str, np.ndarray] = _reader().restore(part, restore_args=as_numpy)
         return restored
 
 
 def _stored(part: pathlib.Path) -> dict[str, Any]:
     """Return what Orbax says of the arrays of a folder, by their path in the tree."""
     with _reading(part):
-        return dict(ocp.PyTreeCheckpointer().metadata(part).item_metadata.tree)
+        return dict(_reader().metadata(part).item_metadata.tree)
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dipn_jax.train import log
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.loop import TrainConfig, fit
 from dipn_jax.train.push import PushTask
