@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from dipn_jax import structs
-from dipn_jax.errors import UserError
+from dipn_jax.storage import held_out
 
 
 def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
-    """Return the training examples, and about the last tenth, 1,000 at most, which is held out.
+    """Return the training examples, and about the last tenth, 1,000 at most, which is held out (`held_out.cut`).
 
     No scene is on both sides.
 
@@ -24,9 +24,5 @@ def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
       UserError: there are fewer than two scenes.
     """
     size = np.asarray(episodes.scene.size)
-    begins = np.flatnonzero((size[1:] != size[:-1]).any((1, 2))) + 1  # first examples of the second, third, ... scene
-    if not len(begins):
-        raise UserError(f"data set {data}: {len(size)} examples of one scene; want at least two scenes")
-    wanted = len(size) - min(1000, max(1, len(size) // 10))
-    cut = int(begins[np.argmin(np.abs(begins - wanted))])
+    cut = held_out.cut([size], len(size), data)
     return structs.take(episodes, slice(0, cut)), structs.take(episodes, slice(cut, len(size)))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import json
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -159,15 +159,30 @@ def read_shard(path: pathlib.Path, *, kind: str) -> Any:
     meta = read_meta(path)
     if meta["kind"] != kind:
         raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
-    columns = {}
     with _reading(path):
-        table = pq.read_table(path, page_checksum_verification=True)
-        for name, spec in meta["columns"].items():
-            column = table.column(name).combine_chunks()
-            flat = column.flatten()
-            if column.null_count or flat.null_count:
-                raise DamagedShard(path, f"its column {name} has empty places")
-            values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"])
-            columns[name] = values.reshape(meta["episodes"], *spec["shape"])
-        coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
-        return codec.assemble(KINDS[kind], codec.decode(columns, coded))
+        return codec.assemble(KINDS[kind], _decoded(path, meta, meta["columns"]))
+
+
+def read_sizes(path: pathlib.Path) -> np.ndarray:
+    """Return the sizes of the objects in the episodes of a shard, `[B, N, 3]` metres, and read nothing else.
+
+    Raises:
+      UserError: see `read_meta`.
+    """
+    meta = read_meta(path)
+    with _reading(path):
+        return _decoded(path, meta, ["scene.size"])["scene.size"]
+
+
+def _decoded(path: pathlib.Path, meta: dict[str, Any], names: Iterable[str]) -> codec.Columns:
+    """Return columns `[B, ...]` of a shard; one that is stored as a difference has to be among them with the other."""
+    specs = {name: meta["columns"][name] for name in names}
+    table, columns = pq.read_table(path, columns=list(specs), page_checksum_verification=True), {}
+    for name, spec in specs.items():
+        column = table.column(name).combine_chunks()
+        flat = column.flatten()
+        if column.null_count or flat.null_count:
+            raise DamagedShard(path, f"its column {name} has empty places")
+        values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"])
+        columns[name] = values.reshape(meta["episodes"], *spec["shape"])
+    return codec.decode(columns, {name: spec for name, spec in specs.items() if "quantum" in spec})
