@@ -51,10 +51,11 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> None:
     _refuse_twice(entries)
     identity, first, names = _plan(sets)
     with owner.owned(out):
+        config = out / "config.json"
         others = {path.name for path in shards.shard_files(out)} - set(names)
-        if others:
-            raise UserError(f"--out {out}: holds {min(others)}, which is none of theirs; give another folder")
-        files.claim(out, identity)
+        if others or (config.exists() and files.read_json(config) != identity):
+            raise UserError(f"--out {out}: holds another data set; give another folder")
+        files.write_json(config, identity)
         if first is not None and (first / accounting.ASKED).exists():
             files.write_json(out / accounting.ASKED, files.read_json(first / accounting.ASKED))
         _copy(dict(zip(names, entries, strict=True)), out)
@@ -84,10 +85,11 @@ def _refuse_twice(entries: Sequence[Entry]) -> None:
     for entry in entries:
         for key in filter(None, (entry.sha256, entry.scenes)):
             if twin := seen.get(key):
-                same = "equal" if twin.sha256 == entry.sha256 else f"both of seed {entry.meta['config']['seed']}"
+                made = f"both made of seed {entry.meta['config'].get('seed')} with number {entry.meta['shard']}"
+                same = "equal" if twin.sha256 == entry.sha256 else made
                 raise UserError(
-                    f"merge: {twin.path} and {entry.path} are {same}: the same episodes twice; leave one of them out, "
-                    "or make it with another --seed"
+                    f"merge: {twin.path} and {entry.path} are {same}: the same scenes twice; leave one of them out, or "
+                    "make it with another --seed"
                 )
             seen[key] = entry
 

@@ -70,7 +70,7 @@ def test_what_is_missing_of_one_data_set_is_said(
         config = files.read_json(folder / "config.json")
         files.write_json(folder / "config.json", config | {"episodes": 48})
     assert merge(*disks, "--out", tmp_path / "j") == 0
-    assert "16 of 48 episodes, shards 1, 2 missing: run `dipn-datagen push" in capsys.readouterr().err
+    assert "24 of 48 episodes, shards 1, 2 missing: run `dipn-datagen push" in capsys.readouterr().err
 
 
 def test_sets_made_apart_are_joined_and_their_difference_is_said(
@@ -118,6 +118,7 @@ def test_what_cannot_be_joined_is_one_line(
     data: Data, other: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refused(says: str, *words: object) -> None:
+        capsys.readouterr()
         assert merge(*words) == 2
         error = capsys.readouterr().err
         assert error.startswith("error: ") and error.count("\n") == 1 and says in error, error
@@ -131,15 +132,18 @@ def test_what_cannot_be_joined_is_one_line(
     refused("is named twice", push, other, "--out", other)
     refused("want one kind", push, data["grasp"], *out)
     same = pathlib.Path(shutil.copytree(push, tmp_path / "same"))
-    refused("are equal: the same episodes twice", push, same, *out)
+    refused("are equal: the same scenes twice", push, same, *out)
     slower = tmp_path / "slower"
     generate(dataclasses.replace(JOB, episodes=4, actions=2, shard_size=4), slower)
-    refused("are both of seed 0: the same episodes twice", push, slower, *out)
+    refused("are both made of seed 0 with number 0: the same scenes twice", push, slower, *out)
     wider = tmp_path / "wider"
     generate(dataclasses.replace(JOB, episodes=4, scene=scenes.fixed_count(4, spread=0.2), shard_size=4), wider)
     refused("has number of object slots 3", push, wider, *out)
     assert not (tmp_path / "j").exists()
-    refused("which is none of theirs", push, other, "--out", wider)
+    refused("holds another data set", push, other, "--out", wider)
+    (wider / "config.json").unlink()
+    shutil.copy(shards.shard_path(wider, 0), shards.shard_path(wider, 7))
+    refused("holds another data set", push, other, "--out", wider)
 
 
 def test_shards_that_were_copied_by_hand_are_listed(
