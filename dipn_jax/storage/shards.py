@@ -24,8 +24,10 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import codec, layout
 from dipn_jax.storage.layout import KINDS
 
-SCHEMA_VERSION = 2
-"""Version of the format; shards of another version are refused."""
+SCHEMA_VERSION = 3
+"""Version of the format that is written."""
+READABLE = (2, SCHEMA_VERSION)
+"""Versions that are read; in 2, poses of pushes are differences in time. Shards of others are refused."""
 COMPRESSION_LEVEL = 9
 """Level of zstd; it takes a few milliseconds a shard, because bytes of the same place of all numbers are neighbours."""
 ROUNDED_START = "rounded"
@@ -132,10 +134,10 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
         found = pq.read_metadata(path)
         schema = found.schema.to_arrow_schema()
         meta = typed.check(typed.parse((schema.metadata or {}).get(_META_KEY, b"{}")), {"schema_version": int})
-        if meta["schema_version"] != SCHEMA_VERSION:
+        if meta["schema_version"] not in READABLE:
             raise UserError(
-                f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it anew "
-                "elsewhere"
+                f"shard {path}: schema version {meta['schema_version']}, want {' or '.join(map(str, READABLE))}; "
+                "generate it anew elsewhere"
             )
         typed.check(meta, layout.META)
         if wrong := layout.problem(meta, schema):
