@@ -121,7 +121,7 @@ def _surveyed(folder: pathlib.Path, manifest: dict[str, Any]) -> tuple[Shard, ..
     for name in manifest["shards"]:
         size = shards.read_sizes(typed.inside(folder, name))
         same = before is not None and before.shape == size[0].shape
-        rows = held_out.begins(size, before if same else None)
+        rows = held_out.begins(size, before=before if same else None)
         goes_on = len(rows) == 0 or rows[0] != 0
         found.append(Shard(folder / name, len(size), first, begun - 1 if goes_on else begun))
         first, begun, before = first + len(size), begun + len(rows), size[-1]

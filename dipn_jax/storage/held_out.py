@@ -15,7 +15,7 @@ MOST = 1000
 
 
 def begins(
-    size: Float[np.ndarray, "B N 3"], before: Float[np.ndarray, "N 3"] | None = None
+    size: Float[np.ndarray, "B N 3"], *, before: Float[np.ndarray, "N 3"] | None = None
 ) -> Int[np.ndarray, " begun"]:
     """Return the rows at which a scene begins: those whose objects have other sizes than in the row before.
 
@@ -43,7 +43,7 @@ def cut(sizes: Iterable[Float[np.ndarray, "_ _ 3"]], count: int, data: pathlib.P
     wanted = count - min(MOST, max(1, count // 10))
     best, first, last = 0, 0, None
     for size in sizes:
-        found = first + begins(size, last)
+        found = first + begins(size, before=last)
         found = found[found > 0]
         if len(found):
             near = int(found[np.argmin(np.abs(found - wanted))])
