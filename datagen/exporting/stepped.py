@@ -152,4 +152,6 @@ class Zarr:
         array[begin:] = values
 
     def finish(self, parts: Sequence[Part]) -> None:
-        """Do nothing: every part is at its place."""
+        """Delete what processes that were killed have left of chunks that were being replaced."""
+        for path in self.out.glob("*.zarr/*/*/*.partial"):
+            path.unlink(missing_ok=True)
