@@ -153,7 +153,7 @@ def _page(folder: pathlib.Path, about: dict[str, Any], counts: Counts, figures: 
         ["episodes", f"{about['episodes']}" + (f" of {about['asked']} asked for" if about["asked"] else "")],
         ["shards", str(about["shards"])],
         ["bytes", f"{about['bytes']:,}"],
-        *[[f"while it was made: {name}", str(number)] for name, number in about["faults"].items()],
+        *[[f"while it was made: {name}", str(number)] for name, number in about["faults"].items() if number],
     ]
     tables = "".join(pages.bars(name, dict(sorted(some.items()))) for name, some in counts.items())
     parts = [

@@ -1,16 +1,19 @@
 """The page of a data set."""
 
+import base64
 import html.parser
 import pathlib
 import re
 import shutil
 import subprocess
 
+import cv2
 import numpy as np
 import pytest
 from dipn_jax.datagen import cli
 
 from dipn_jax import console, files
+from dipn_jax.sight import render
 from dipn_jax.storage import records
 from dipn_jax.structs import Fault
 from dipn_jax.world import shapes
@@ -56,6 +59,10 @@ def test_pushes_can_be_sifted_by_what_they_are(data: Data, tmp_path: pathlib.Pat
         assert set(str(one["data-shape"]).split()) == {shapes.CLASSES[i] for i in pushes.scene.shape[number]}
         apart = np.linalg.norm(pushes.after[number, :, :3] - pushes.poses[number, 0, :, :3], axis=-1)
         assert one["data-outcome"] == f"{(apart > 0.001).sum()}-moved"
+    content = base64.b64decode(str(page.all("img")[1]["src"]).partition(",")[2])
+    after = render.observe(pushes.scene[numbers[:1]], pushes.after[numbers[:1]]).color[0]
+    shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_allclose(shown / 255, np.asarray(after)[::-2, ::2], atol=0.51 / 255)
     assert [one["name"] for one in page.all("select")] == ["fault", "distance", "outcome", "shape"]
 
 

@@ -133,6 +133,14 @@ def test_what_cannot_be_joined_is_one_line(
     refused("want one kind", push, data["grasp"], *out)
     same = pathlib.Path(shutil.copytree(push, tmp_path / "same"))
     refused("are equal: the same scenes twice", push, same, *out)
+    unsaid = [tmp_path / "unsaid1", tmp_path / "unsaid2"]  # without a seed, equal bytes alone tell
+    for number, folder in enumerate(unsaid):
+        folder.mkdir()
+        episodes = shards.read_shard(shards.shard_path(push, 0), kind="push")
+        shards.write_shard(folder, 0, episodes[number:], kind="push", config={}, faults={})
+        shards.write_shard(folder, 1, episodes[:5], kind="push", config={}, faults={})
+        records.update_manifest(folder)
+    refused("shard-00001.parquet are equal: the same scenes twice", *unsaid, *out)
     slower = tmp_path / "slower"
     generate(dataclasses.replace(JOB, episodes=4, actions=2, shard_size=4), slower)
     refused("are both made of seed 0 with number 0: the same scenes twice", push, slower, *out)

@@ -176,10 +176,16 @@ def test_every_column_has_the_type_and_the_shape_that_it_is_said_to_have(data: D
 def test_pictures_are_what_the_camera_sees(data: Data) -> None:
     pushes, _ = records.load(data["push"], kind="push")
     some = pushes[:2]
-    for images, moment, poses in (("all", "all", some.poses[:, 3]), ("both", "after", some.after)):
+    before, after = some.poses[:, 0], some.after
+    assert np.abs(before - some.poses[:, 10]).max() > 0.01
+    for images, moment, poses in (
+        ("all", "all", some.poses[:, 10]),
+        ("both", "after", after),
+        ("before", "before", before),
+    ):
         values = drawn.draw(some, images)
         seen = render.observe(some.scene, poses)
-        at = (slice(None), 3) if images == "all" else ()
+        at = (slice(None), 10) if images == "all" else ()
         np.testing.assert_array_equal(values[f"height_{moment}"][at], seen.height)
         np.testing.assert_array_equal(values[f"label_{moment}"][at], seen.label)
         np.testing.assert_allclose(values[f"color_{moment}"][at] / 255, seen.color, atol=0.5 / 255)
