@@ -4,11 +4,13 @@ import dataclasses
 import json
 import pathlib
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
 from dipn_jax.datagen import cli
 from dipn_jax.datagen.generate import Job, generate
+from dipn_jax.train import split
 from dipn_jax.train.push import PushTask
 
 from dipn_jax import console, files
@@ -25,6 +27,15 @@ Data = dict[str, pathlib.Path]
 
 def merge(*words: object) -> int:
     return console.run("dipn-datagen", cli.COMMANDS, ["merge", *map(str, words)])
+
+
+def write(folder: pathlib.Path, parts: list[Any], config: dict[str, Any]) -> pathlib.Path:
+    """Write a data set of pushes with these shards."""
+    folder.mkdir()
+    for index, episodes in enumerate(parts):
+        shards.write_shard(folder, index, episodes, kind="push", config=config, faults={})
+    records.update_manifest(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -134,18 +145,15 @@ def test_what_cannot_be_joined_is_one_line(
     same = pathlib.Path(shutil.copytree(push, tmp_path / "same"))
     refused("are equal: the same scenes twice", push, same, *out)
     unsaid = [tmp_path / "unsaid1", tmp_path / "unsaid2"]  # without a seed, equal bytes alone tell
+    path = shards.shard_path(push, 0)
+    episodes, config = shards.read_shard(path, kind="push"), shards.read_meta(path)["config"]
     for number, folder in enumerate(unsaid):
-        folder.mkdir()
-        episodes = shards.read_shard(shards.shard_path(push, 0), kind="push")
-        shards.write_shard(folder, 0, episodes[number:], kind="push", config={}, faults={})
-        shards.write_shard(folder, 1, episodes[:5], kind="push", config={}, faults={})
-        records.update_manifest(folder)
+        write(folder, [episodes[number:], episodes[:5]], {})
     refused("shard-00001.parquet are equal: the same scenes twice", *unsaid, *out)
-    slower = tmp_path / "slower"
-    generate(dataclasses.replace(JOB, episodes=4, actions=2, shard_size=4), slower)
+    slower = write(tmp_path / "slower", [episodes[:4]], config | {"actions": 2})
     refused("are both made of seed 0 with number 0: the same scenes twice", push, slower, *out)
-    wider = tmp_path / "wider"
-    generate(dataclasses.replace(JOB, episodes=4, scene=scenes.fixed_count(4, spread=0.2), shard_size=4), wider)
+    wider = write(tmp_path / "wider", [split.widened(episodes, 4)], {"seed": 9})
+    files.write_json(wider / "config.json", JOB.describe())
     refused("has number of object slots 3", push, wider, *out)
     assert not (tmp_path / "j").exists()
     refused("holds another data set", push, other, "--out", wider)
