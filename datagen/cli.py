@@ -1,4 +1,4 @@
-"""The program `dipn-datagen`: push, grasp, images, replay, check-world, verify, repair, info."""
+"""The program `dipn-datagen`: push, grasp, images, replay, export, merge, check-world, verify, repair, info."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
 from . import upkeep
 from .check_command import check_world
+from .export_command import export
+from .merge_command import merge
 from .replay_command import replay
 
 if TYPE_CHECKING:
@@ -217,6 +219,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "grasp": grasp,
     "images": images,
     "replay": replay,
+    "export": export,
+    "merge": merge,
     "check-world": check_world,
     "verify": upkeep.verify,
     "repair": upkeep.repair,

@@ -226,4 +226,6 @@ def _claim(job: Job, out: pathlib.Path) -> None:
 def _begun_with(out: pathlib.Path) -> int:
     """Return the number of episodes that the folder was begun with; 0 if it was not."""
     path = out / "config.json"
+    if accounting.merged(out) is not None:
+        raise UserError(f"{out}: a merged data set, which no command extends; give another --out")
     return int(files.read_json(path, wanted={"episodes": typed.Whole()})["episodes"]) if path.exists() else 0

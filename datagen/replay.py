@@ -94,6 +94,13 @@ def open_set(folder: pathlib.Path) -> Set:
     episodes, _ = records.load(folder, kind=kind)
     paths = sorted(folder.glob("shard-*.parquet"))
     metas = [shards.read_meta(path) for path in paths]
+    ways = {(str(meta["config"].get("engine")), meta["config"].get("timestep")) for meta in metas}
+    if len(ways) > 1:
+        named = sorted(f"{engine} at {f'{step} s' if step else 'its own step'}" for engine, step in ways)
+        raise UserError(
+            f"data set {folder}: merged from sets that were simulated differently ({', '.join(named)}); replay each of "
+            "them by itself"
+        )
     old = sum(meta.get("start") != shards.ROUNDED_START for meta in metas)
     others = {str(meta.get("instructions", machine.instructions())) for meta in metas} - {machine.instructions()}
     return Set(folder, kind, about["config"], episodes, old, tuple(sorted(others)))

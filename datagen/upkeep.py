@@ -14,6 +14,9 @@ import tyro
 from dipn_jax import console
 from dipn_jax.errors import UserError
 
+MOST_SHOWN = 2000
+"""Episodes on a page at most: about 10 MB."""
+
 
 def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     """Check every shard, and that all episodes that were asked for are there; exit 2 if something is wrong.
@@ -29,7 +32,7 @@ def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     problems = records.verify(folder)
     if problems:
         path, what = problems[0]
-        raise UserError(f"{path}: {what} ({len(problems)} wrong in all); run dipn-datagen repair {folder}")
+        raise UserError(f"{path}: {what} ({len(problems)} such in all); {records.advice(folder, problems)}")
     if said := records.missing(folder):
         raise UserError(said)
     console.say(f"{folder}: all shards are whole")
@@ -48,18 +51,37 @@ def repair(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     console.say(records.missing(folder) or f"{folder}: nothing is missing")
 
 
-def info(folder: tyro.conf.Positional[pathlib.Path]) -> None:
+def info(
+    folder: tyro.conf.Positional[pathlib.Path],
+    html: pathlib.Path | None = None,
+    sample: int = 100,
+    seed: int = 0,
+) -> None:
     """Print what a data set holds, as JSON: episodes, bytes, config, faults counted, and who made it.
 
     `made_by` lists every combination of versions and kind of processor. On standard error, a line says where they
     differ, and one what is missing of the episodes that were asked for.
 
+    One page for a browser, with counts of what was drawn, and pictures to be sifted by fault, shape and outcome:
+      dipn-datagen info data/push --html push.html --sample 200
+
     Args:
       folder: a data set.
+      html: file of the page, which needs no other.
+      sample: episodes on the page, drawn at random.
+      seed: of that draw.
     """
     from dipn_jax.storage import accounting, records
 
+    console.require_between(1, MOST_SHOWN, sample=sample)
+    console.require_seed(seed)
     summary = records.summary(folder)
+    if html is not None:
+        from . import browsing
+
+        if html.is_dir():
+            raise UserError(f"--html {html}: is a folder; give the name of a file")
+        browsing.write(folder, html, sample=sample, seed=seed)
     console.say(json.dumps(summary, indent=1))
     mixed = accounting.mixed(summary["made_by"])
     for said in (mixed and f"{folder}: {mixed}", summary["missing"]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import functools
@@ -13,6 +14,7 @@ import pathlib
 import secrets
 import shutil
 import time
+from collections.abc import Iterator
 from typing import Any
 
 from dipn_jax import typed
@@ -80,14 +82,24 @@ def file_sha256(path: pathlib.Path) -> str:
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
     """Write a file under a temporary name, then `move` it."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextlib.contextmanager
+def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Return a context whose value is a temporary path: what is written there gets the name `path` at the end.
+
+    Where something is raised, nothing of it is left.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     # workers in containers may share process numbers
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
-        temporary.write_bytes(data)
+        yield temporary
         move(temporary, path)
     except OSError as error:  # a write that fails does not say where
-        raise OSError(error.errno, error.strerror, str(path)) from None
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
     finally:
         temporary.unlink(missing_ok=True)
 

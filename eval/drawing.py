@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import io
 import pathlib
 from collections.abc import Mapping
@@ -15,28 +13,14 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import files
+from dipn_jax import files, pages
 from dipn_jax.workspace import WORKSPACE
-
-
-def escaped(text: str) -> str:
-    """What a user named, for a page: neither markup nor the place of a figure (`{NAME}`)."""
-    return html.escape(text).replace("{", "&#123;")
 
 
 def label(text: str) -> str:
     """What a user named, for a figure: `$` is no formula, bytes of a name that are no text are replaced."""
     readable = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     return readable.replace("$", r"\$")
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """Return an HTML table of plain text."""
-
-    def line(cells: list[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{escaped(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"
 
 
 def percent(values: Mapping[str, Any], measure: str) -> str:
@@ -55,9 +39,7 @@ def image(figure: Any, path: pathlib.Path) -> str:
     figure.savefig(stream, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)
     files.write_atomically(path, stream.getvalue())
-    return (
-        f'<img alt="{escaped(path.stem)}" src="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}">'
-    )
+    return pages.picture(stream.getvalue(), path.stem)
 
 
 def show(axis: Any, picture: np.ndarray, title: str = "") -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import importlib.util
 import json
 import pathlib
 import re
@@ -13,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import tyro
+from dipn_jax.datagen.exporting.export import NEEDS
 from dipn_jax.eval.report import paper
 
 from benchmarks.__main__ import BENCHMARKS
@@ -148,10 +150,20 @@ def prepare(folder: pathlib.Path, data: dict[str, pathlib.Path]) -> None:
     (folder / "my_cases.json").write_text(json.dumps(cases))
 
 
+def export_all(page: pathlib.Path) -> None:
+    """Run the commands of a page that export a data set in formats whose libraries are there."""
+    for program, *arguments in commands(page):
+        form = arguments[arguments.index("--format") + 1] if "--format" in arguments else "parquet"
+        if all(importlib.util.find_spec(name) for name in NEEDS.get(form, ())):
+            assert console.run(program, importlib.import_module(runs.PROGRAMS[program]).COMMANDS, arguments) == 0
+
+
 @pytest.mark.parametrize("page", [ROOT / "README.md", *HOWTO], ids=lambda page: page.name)
 def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
     prepare(tmp_path, data)
     with contextlib.chdir(tmp_path):
+        if page.name == "other_tools.md":
+            export_all(page)
         names = tutorial_pictures.run(page)
     if page.name == "README.md":
         decision, observation = names["decision"], names["observation"]
@@ -166,6 +178,8 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
         assert names["names"] == ["two-cubes"] and names["observation"].slots == 2
     elif page.name == "weights_elsewhere.md":
         assert names["kernel"].shape == (3, 3, 64, 24) and names["about"]["network"] == "grasp"
+    elif page.name == "other_tools.md":
+        assert names["pushes"].num_rows == 24 and names["some"]["height_before"].shape[1:] == (224, 224)
     elif page.name == "many_workers.md":
         assert names["episodes"].poses.shape[:2] == (24, 11)
         wanted = render.render(names["pushes"].scene[3], names["pushes"].poses[3, 0])

@@ -50,7 +50,7 @@ def _initial(init: pathlib.Path | None, network: str) -> Any:
 
 
 def push(
-    data: pathlib.Path,
+    data: tuple[pathlib.Path, ...],
     out: pathlib.Path,
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
@@ -71,7 +71,7 @@ def push(
         --batch 8 --weight-decay 2e-4 --limit 1500 --steps 9375 --centimetres 5
 
     Args:
-      data: folder of push episodes.
+      data: folders of push episodes; of each the last tenth is held out.
       out: run folder; the same command continues where it stopped.
       init: run to start from, or builtin; its architecture is used.
       preset: architecture, without --init.
@@ -94,7 +94,7 @@ def push(
 
 
 def grasp_pretrain(
-    data: pathlib.Path,
+    data: tuple[pathlib.Path, ...],
     out: pathlib.Path,
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
@@ -107,7 +107,7 @@ def grasp_pretrain(
       dipn-train grasp-pretrain --data data/images --out runs/gn-pretrained
 
     Args:
-      data: folder of settled scenes (dipn-datagen images).
+      data: folders of settled scenes (dipn-datagen images).
       out: run folder; the same command continues where it stopped.
       init: run to start from, or builtin; its architecture is used.
       preset: architecture, without --init.

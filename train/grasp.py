@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import pathlib
 from typing import Any
 
 import flax.struct
@@ -13,15 +12,14 @@ import numpy as np
 from flax import nnx
 
 from dipn_jax import batching, console, geometry, structs
-from dipn_jax.errors import UserError
 from dipn_jax.networks import grasp, losses
 from dipn_jax.sight import fingers, render
-from dipn_jax.storage import plain, records
-from dipn_jax.structs import ABSENT, Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
+from dipn_jax.storage import plain
+from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
-from dipn_jax.world import scenes, shapes
+from dipn_jax.world import shapes
 
-from .split import split
+from .split import Folders, load_sides
 
 PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
@@ -58,11 +56,11 @@ class PretrainTask:
 
     network = "grasp"
 
-    def __init__(self, data: pathlib.Path, config: grasp.GraspConfig) -> None:
-        settled, self.fingerprint = records.load(data, kind="images")
-        self.examples = len(settled.fault)
-        self.train_set, self.test_set = split(settled, data)
+    def __init__(self, data: Folders, config: grasp.GraspConfig) -> None:
+        sides = load_sides(data, kind="images")
+        self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
         self.size = len(self.train_set.fault)
+        self.examples = self.size + len(self.test_set.fault)
         self.network_config = config
 
     def fetch(self, index: np.ndarray) -> SettledScene:
@@ -189,7 +187,7 @@ class GraspTask:
 
     network = "grasp"
 
-    def __init__(self, data: tuple[pathlib.Path, ...], config: grasp.GraspConfig) -> None:
+    def __init__(self, data: Folders, config: grasp.GraspConfig) -> None:
         """Load data sets.
 
         Args:
@@ -199,14 +197,8 @@ class GraspTask:
         Raises:
           UserError: no folder; or one is damaged, or holds something else.
         """
-        if not data:
-            raise UserError("--data: want at least one folder of dipn-datagen grasp")
-        loaded = [records.load(folder, kind="grasp") for folder in data]
-        slots = max(episodes.scene.shape.shape[1] for episodes, _ in loaded)
-        sides = [split(_widened(episodes, slots), folder) for (episodes, _), folder in zip(loaded, data, strict=True)]
-        self.train_set = structs.concatenate([learnt for learnt, _ in sides])
-        self.test_set = structs.concatenate([held_out for _, held_out in sides])
-        self.fingerprint = ":".join(fingerprint for _, fingerprint in loaded)
+        sides = load_sides(data, kind="grasp")
+        self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
         self.size = self.examples = len(self.train_set.fault)
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
@@ -259,19 +251,3 @@ def _measure(graph: Any, state: Any, batch: Window, weight: jax.Array) -> tuple[
     logits = nnx.merge(graph, state)(images)[jnp.arange(len(images)), pixel[:, 0], pixel[:, 1]]
     loss = losses.score_loss(logits, batch.target, weight) * weight.sum()
     return loss, ((logits > 0) == (batch.target > 0.5)) @ weight
-
-
-def _widened(episodes: GraspEpisode, slots: int) -> GraspEpisode:
-    """Return episodes `[B, N]` as `[B, slots]`, so that data sets of different numbers of objects can be joined."""
-    more = slots - episodes.scene.shape.shape[1]
-    if not more:
-        return episodes
-
-    def pad(leaf: Array, value: float = 0) -> np.ndarray:
-        edges = [(0, 0), (0, more)] + [(0, 0)] * (leaf.ndim - 2)
-        return np.pad(leaf, edges, constant_values=value)
-
-    scene = jax.tree.map(pad, episodes.scene).replace(shape=pad(episodes.scene.shape, ABSENT))
-    away = np.broadcast_to(scenes.parked(more), (len(episodes.fault), more, 7))
-    poses, after = (np.concatenate([part, away], 1) for part in (episodes.poses, episodes.after))
-    return episodes.replace(scene=scene, poses=poses, after=after, held=pad(episodes.held))

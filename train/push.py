@@ -17,12 +17,11 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, losses, push_frame
 from dipn_jax.networks.push_frame import PushInput, View
 from dipn_jax.sight import render, segment
-from dipn_jax.storage import records
 from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
-from .split import split
+from .split import Folders, load_sides
 
 
 @flax.struct.dataclass
@@ -41,7 +40,7 @@ class PushTask:
 
     def __init__(
         self,
-        data: pathlib.Path,
+        data: Folders,
         config: dipn.DipnConfig,
         *,
         limit: int | None,
@@ -49,10 +48,10 @@ class PushTask:
         without: tuple[str, ...] = (),
         found: bool = False,
     ) -> None:
-        """Load a data set.
+        """Load data sets.
 
         Args:
-          data: folder of push episodes.
+          data: folders of push episodes; the last tenth of each is held out.
           config: architecture.
           limit: learn from this number of episodes only, the first ones; the same ones are held out.
           centimetres: distances learnt, each 1 to 10.
@@ -61,33 +60,24 @@ class PushTask:
         """
         if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
             raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
-        episodes, fingerprint = records.load(data, kind="push")
-        if without:
-            classes = [shapes.CLASSES.index(name) for name in without]
-            kept = np.flatnonzero(~np.isin(episodes.scene.shape, classes).any(1))
-            if not len(kept):
-                raise UserError(
-                    f"--without {' '.join(without)}: leaves none of the pushes of {data}; name fewer classes"
-                )
-            episodes = structs.take(episodes, kept)
-        shortest = 100 * float(np.min(episodes.push.distance))
-        if min(centimetres) > shortest + 0.01:
-            raise UserError(
-                f"--centimetres {centimetres}: {data} has pushes of {shortest:.0f} cm; give as low a number"
-            )
-        learnt, self.test_set = split(episodes, data)
+
+        def choose(episodes: PushEpisode, folder: pathlib.Path) -> PushEpisode:
+            return _chosen(episodes, folder, centimetres, without)
+
+        sides = load_sides(data, kind="push", choose=choose)
+        learnt, self.test_set = sides.learnt, sides.held_out
         count = len(learnt.fault)
         if limit is not None and not 1 <= limit <= count:
-            raise UserError(f"--limit {limit}: want 1 to {count}, the pushes of {data} that are not held out")
+            raise UserError(f"--limit {limit}: want 1 to {count}, the pushes of --data that are not held out")
         count = count if limit is None else limit
         self.train_set = structs.take(learnt, slice(0, count))
         self.network_config = config
         self.size = self.examples = count
         masks = ("found",) if found else ()
-        self.fingerprint = ":".join(map(str, (fingerprint, count, centimetres, *without, *masks)))
+        self.fingerprint = ":".join(map(str, (sides.fingerprint, count, centimetres, *without, *masks)))
         self.centimetres = np.array(centimetres, np.int32)
         self.found = found
-        self.slots = episodes.scene.shape.shape[1]
+        self.slots = sides.slots
         self._kept: Example | None = None
         self._held_out: Example | None = None
 
@@ -165,6 +155,26 @@ class PushTask:
             total["held_out_loss"].append((self._share * float(loss), int(weight.sum())))
             total["moved_error_mm"].append((float(error), float(moved)))
         return {name: sum(v * w for v, w in rows) / max(sum(w for _, w in rows), 1e-9) for name, rows in total.items()}
+
+
+def _chosen(
+    episodes: PushEpisode, folder: pathlib.Path, centimetres: tuple[int, ...], without: tuple[str, ...]
+) -> PushEpisode:
+    """Return the episodes of a data set without those that have an object of some classes.
+
+    Raises:
+      UserError: none is left, or pushes are shorter than the distances that are to be learnt.
+    """
+    if without:
+        classes = [shapes.CLASSES.index(name) for name in without]
+        kept = np.flatnonzero(~np.isin(episodes.scene.shape, classes).any(1))
+        if not len(kept):
+            raise UserError(f"--without {' '.join(without)}: leaves none of the pushes of {folder}; name fewer classes")
+        episodes = structs.take(episodes, kept)
+    shortest = 100 * float(np.min(episodes.push.distance))
+    if min(centimetres) > shortest + 0.01:
+        raise UserError(f"--centimetres {centimetres}: {folder} has pushes of {shortest:.0f} cm; give as low a number")
+    return episodes
 
 
 def _mirrored(key: jax.Array, inputs: PushInput, target: Array) -> tuple[PushInput, jax.Array]:

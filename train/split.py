@@ -1,18 +1,85 @@
-"""Split of a data set: which examples are held out for the learning curve."""
+"""Data sets that are learnt from: joined, and split into what is learnt and what is held out for the curve."""
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
+from dipn_jax.storage import held_out, records
+from dipn_jax.structs import ABSENT, Array
+from dipn_jax.world import scenes
+
+Folders = pathlib.Path | tuple[pathlib.Path, ...]
+"""One data set, or several."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sides:
+    """Episodes of one data set or of several, split."""
+
+    learnt: Any  # [B]
+    held_out: Any  # [B]: the last tenth of each data set
+    fingerprint: str
+
+    @property
+    def slots(self) -> int:
+        """The number of object slots."""
+        return int(self.learnt.scene.shape.shape[1])
+
+
+def load_sides(
+    data: Folders, *, kind: str, choose: Callable[[Any, pathlib.Path], Any] = lambda episodes, _: episodes
+) -> Sides:
+    """Load data sets and split each; they may have different numbers of object slots.
+
+    Args:
+      data: their folders.
+      kind: of their episodes.
+      choose: function of the episodes of a data set and its folder that returns those to be used.
+
+    Raises:
+      UserError: no folder; or one is damaged, holds something else, or cannot be split.
+    """
+    folders = (data,) if isinstance(data, pathlib.Path) else data
+    if not folders:
+        raise UserError(f"--data: want at least one folder of dipn-datagen {kind}")
+    loaded = [records.load(folder, kind=kind) for folder in folders]
+    slots = max(episodes.scene.shape.shape[1] for episodes, _ in loaded)
+    chosen = [choose(widened(episodes, slots), folder) for (episodes, _), folder in zip(loaded, folders, strict=True)]
+    sides = [split(episodes, folder) for episodes, folder in zip(chosen, folders, strict=True)]
+    learnt, held = sides[0] if len(sides) == 1 else map(structs.concatenate, map(list, zip(*sides, strict=True)))
+    return Sides(learnt, held, ":".join(fingerprint for _, fingerprint in loaded))
+
+
+def widened(episodes: Any, slots: int) -> Any:
+    """Return episodes `[B, N]` as `[B, slots]`, so that data sets of different numbers of objects can be joined."""
+    more = slots - episodes.scene.shape.shape[1]
+    if not more:
+        return episodes
+
+    def pad(leaf: Array, value: float = 0) -> np.ndarray:
+        edges = [(0, 0), (0, more)] + [(0, 0)] * (leaf.ndim - 2)
+        return np.pad(leaf, edges, constant_values=value)
+
+    def park(poses: Array) -> np.ndarray:
+        away = np.broadcast_to(scenes.parked(more), (*poses.shape[:-2], more, 7))
+        return np.concatenate([poses, away], -2)
+
+    changes = {name: park(getattr(episodes, name)) for name in ("poses", "after") if hasattr(episodes, name)}
+    changes |= {"held": pad(episodes.held)} if hasattr(episodes, "held") else {}
+    scene = jax.tree.map(pad, episodes.scene).replace(shape=pad(episodes.scene.shape, ABSENT))
+    return episodes.replace(scene=scene, **changes)
 
 
 def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
-    """Return the training examples, and about the last tenth, 1,000 at most, which is held out.
+    """Return the training examples, and about the last tenth, 1,000 at most, which is held out (`held_out.cut`).
 
     No scene is on both sides.
 
@@ -24,9 +91,5 @@ def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
       UserError: there are fewer than two scenes.
     """
     size = np.asarray(episodes.scene.size)
-    begins = np.flatnonzero((size[1:] != size[:-1]).any((1, 2))) + 1  # first examples of the second, third, ... scene
-    if not len(begins):
-        raise UserError(f"data set {data}: {len(size)} examples of one scene; want at least two scenes")
-    wanted = len(size) - min(1000, max(1, len(size) // 10))
-    cut = int(begins[np.argmin(np.abs(begins - wanted))])
+    cut = held_out.cut([size], len(size), data)
     return structs.take(episodes, slice(0, cut)), structs.take(episodes, slice(cut, len(size)))

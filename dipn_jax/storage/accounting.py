@@ -46,6 +46,18 @@ def note(folder: pathlib.Path, command: Sequence[str], *, of: int) -> None:
     files.write_json(folder / ASKED, {"command": list(command), "of": of})
 
 
+def command(folder: pathlib.Path) -> list[str] | None:
+    """Return the words of the command that makes a data set, without its folder; None where they are not kept.
+
+    Raises:
+      UserError: the file that keeps them is damaged.
+    """
+    path = folder / ASKED
+    if not path.exists():
+        return None
+    return ["dipn-datagen", *files.read_json(path, wanted={"command": [str]})["command"]]
+
+
 def asked(folder: pathlib.Path) -> Asked | None:
     """Return what was asked for of a data set; None where its folder does not say it.
 
@@ -55,8 +67,26 @@ def asked(folder: pathlib.Path) -> Asked | None:
     path = folder / "config.json"
     if not path.exists():
         return None
+    if merged(folder) is not None:
+        return None
     found = files.read_json(path, wanted={"episodes": typed.Whole(1), "shard_size": typed.Whole(1)})
     return Asked(found["episodes"], found["shard_size"])
+
+
+def merged(folder: pathlib.Path) -> list[dict[str, Any]] | None:
+    """Return what was joined to a merged data set: of each part its `config` and the number of its `episodes`.
+
+    None for a data set that was made by one command.
+
+    Raises:
+      UserError: its configuration is damaged.
+    """
+    path = folder / "config.json"
+    if not path.exists():
+        return None
+    parts = [{"config": dict, "episodes": typed.Whole(1)}]
+    found: dict[str, Any] = files.read_json(path, wanted={"merged?": parts})
+    return found.get("merged")
 
 
 def held(entries: Mapping[str, Any]) -> dict[int, int]:

@@ -1,7 +1,8 @@
 """Episodes as columns of whole multiples of a quantum, so that a file holds what could be measured and no noise.
 
-Poses of a push are stored as changes from centimetre to centimetre, and poses after an action as changes from those
-before: most objects do not move, and zeros take no room. A decoded value is within half a quantum.
+Poses after an action are stored as changes from the last ones before: most objects do not move any more, and zeros take
+no room. The poses of a push are stored as they are: what stands still repeats itself, which compresses better than
+changes from centimetre to centimetre. A decoded value is within half a quantum.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def encode(columns: Columns) -> tuple[Columns, dict[str, dict[str, Any]]]:
 
     Returns:
       Columns of the same names and shapes, quantized ones as int32; and for each of those the keys `quantum` and
-      `code`: `value`, `delta` (differences along the second axis) or `from poses` (from the last of `poses`).
+      `code`: `value`, or `from poses` (differences from the last of `poses`).
 
     Raises:
       ValueError: a value to quantize is not finite, or too large.
@@ -80,9 +81,6 @@ def encode(columns: Columns) -> tuple[Columns, dict[str, dict[str, Any]]]:
     if "after" in stored and "poses" in stored:
         stored["after"] = stored["after"] - _last(stored["poses"], stored["after"])
         specs["after"]["code"] = "from poses"
-    if "poses" in stored and columns["poses"].ndim == 4:
-        stored["poses"] = np.diff(stored["poses"], axis=1, prepend=0)
-        specs["poses"]["code"] = "delta"
     return {k: v.astype(np.int32) if k in specs else v for k, v in stored.items()}, specs
 
 
@@ -92,7 +90,10 @@ def _last(poses: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def decode(stored: Columns, specs: dict[str, dict[str, Any]]) -> Columns:
-    """Return the inverse of `encode`; quantized columns become float32."""
+    """Return the inverse of `encode`; quantized columns become float32.
+
+    It also knows the code `delta` of shards of version 2: differences along the second axis.
+    """
     columns = {name: value.astype(np.int64) if name in specs else value for name, value in stored.items()}
     if specs.get("poses", {}).get("code") == "delta":
         columns["poses"] = np.cumsum(columns["poses"], axis=1)

@@ -23,6 +23,8 @@ except ImportError:  # Windows
 
 MANIFEST = "manifest.json"
 """Name of the file that lists the shards of a data set."""
+UNLISTED = "is not listed in the manifest yet"
+"""What `verify` says of a shard that was copied into the folder."""
 _FORM = {
     "kind": typed.Maybe(set(layout.KINDS)),
     "shards": {
@@ -130,7 +132,7 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
     """Return the shards that are missing, damaged or unlisted, each with what is wrong; empty if none is."""
     listed = _read_manifest(folder)["shards"]
     checked = [(folder / name, _problem(folder / name, entry)) for name, entry in listed.items()]
-    unlisted = [(path, "not in the manifest") for path in shards.shard_files(folder) if path.name not in listed]
+    unlisted = [(path, UNLISTED) for path in shards.shard_files(folder) if path.name not in listed]
     return [(path, what) for path, what in checked if what] + unlisted
 
 
@@ -171,7 +173,8 @@ def summary(folder: pathlib.Path) -> dict[str, Any]:
     """Describe a data set: counts, bytes, faults, who made it, and the config and versions of its first shard.
 
     `asked` is the number of episodes that were asked for, and `missing` says in one line what is not there of them;
-    both are None where nothing is known. `made_by` lists every combination of versions and kind of processor.
+    both are None where nothing is known. `made_by` lists every combination of versions and kind of processor,
+    `merged` what was joined to a merged data set.
     """
     manifest = _read_manifest(folder)
     entries = manifest["shards"]
@@ -192,6 +195,7 @@ def summary(folder: pathlib.Path) -> dict[str, Any]:
         "faults": faults,
         "config": metas[0]["config"] if metas else None,
         "versions": metas[0]["versions"] if metas else None,
+        "merged": accounting.merged(folder),
         "made_by": accounting.makers(metas),
     }
 
@@ -240,26 +244,57 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
     Raises:
       UserError: no such data set, a shard is missing or damaged, or it holds another kind.
     """
-    manifest = _read_manifest(folder)
-    problems = verify(folder)
-    if problems:
-        path, what = problems[0]
-        raise UserError(
-            f"data set {folder}: {path.name} {what} ({len(problems)} of {len(manifest['shards'])} shards wrong); "
-            f"run dipn-datagen repair {folder}, then generate again"
-        )
-    if not manifest["shards"]:
-        raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
+    manifest = checked(folder, kind=kind)
+    parts = [shards.read_shard(folder / name, kind=kind) for name in manifest["shards"]]
+    widths = {part.scene.shape.shape[1] for part in parts}
+    if len(widths) > 1:
+        raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
+    episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return episodes, fingerprint(manifest)
+
+
+def fingerprint(manifest: dict[str, Any]) -> str:
+    """Return a fingerprint of the data set that has this manifest: it follows from the content of the shards."""
+    return hashlib.sha256(json.dumps([entry["sha256"] for entry in manifest["shards"].values()]).encode()).hexdigest()
+
+
+def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
+    """Return the manifest of a data set after checking every shard; it lists one at least.
+
+    Where episodes that were asked for have not been made, one line says so.
+
+    Args:
+      folder: the data set.
+      kind: of its episodes, for the message that says how to make some.
+
+    Raises:
+      UserError: no such data set, or a shard is missing or damaged.
+    """
+    manifest = whole(folder, kind=kind)
     try:
         said = accounting.missing(folder, accounting.held(manifest["shards"]))
     except UserError as error:  # what was asked for cannot be read; the shards are whole all the same
         said = str(error)
     if said:
         console.warn(said)
-    parts = [shards.read_shard(folder / name, kind=kind) for name in manifest["shards"]]
-    widths = {part.scene.shape.shape[1] for part in parts}
-    if len(widths) > 1:
-        raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
-    episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    text = json.dumps([entry["sha256"] for entry in manifest["shards"].values()])
-    return episodes, hashlib.sha256(text.encode()).hexdigest()
+    return manifest
+
+
+def whole(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
+    """Return the manifest as `checked` does, whatever is missing of what was asked for."""
+    manifest = _read_manifest(folder)
+    if problems := verify(folder):
+        number = f"{len(problems)} of {max(len(manifest['shards']), len(problems))} shards"
+        raise UserError(
+            f"data set {folder}: {problems[0][0].name} {problems[0][1]} ({number}); {advice(folder, problems)}"
+        )
+    if not manifest["shards"]:
+        raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
+    return manifest
+
+
+def advice(folder: pathlib.Path, problems: list[tuple[pathlib.Path, str]]) -> str:
+    """Return what is to be done about what `verify` has found."""
+    if all(what == UNLISTED for _, what in problems):
+        return f"if you copied them there, run dipn-datagen merge {folder}"
+    return f"run dipn-datagen repair {folder}, then generate again"

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import json
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,10 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import codec, layout
 from dipn_jax.storage.layout import KINDS
 
-SCHEMA_VERSION = 2
-"""Version of the format; shards of another version are refused."""
+SCHEMA_VERSION = 3
+"""Version of the format that is written."""
+READABLE = (2, SCHEMA_VERSION)
+"""Versions that are read; in 2, poses of pushes are differences in time. Shards of others are refused."""
 COMPRESSION_LEVEL = 9
 """Level of zstd; it takes a few milliseconds a shard, because bytes of the same place of all numbers are neighbours."""
 ROUNDED_START = "rounded"
@@ -132,10 +134,10 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
         found = pq.read_metadata(path)
         schema = found.schema.to_arrow_schema()
         meta = typed.check(typed.parse((schema.metadata or {}).get(_META_KEY, b"{}")), {"schema_version": int})
-        if meta["schema_version"] != SCHEMA_VERSION:
+        if meta["schema_version"] not in READABLE:
             raise UserError(
-                f"shard {path}: schema version {meta['schema_version']}, want {SCHEMA_VERSION}; generate it anew "
-                "elsewhere"
+                f"shard {path}: schema version {meta['schema_version']}, want {' or '.join(map(str, READABLE))}; "
+                "generate it anew elsewhere"
             )
         typed.check(meta, layout.META)
         if wrong := layout.problem(meta, schema):
@@ -159,15 +161,30 @@ def read_shard(path: pathlib.Path, *, kind: str) -> Any:
     meta = read_meta(path)
     if meta["kind"] != kind:
         raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
-    columns = {}
     with _reading(path):
-        table = pq.read_table(path, page_checksum_verification=True)
-        for name, spec in meta["columns"].items():
-            column = table.column(name).combine_chunks()
-            flat = column.flatten()
-            if column.null_count or flat.null_count:
-                raise DamagedShard(path, f"its column {name} has empty places")
-            values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"])
-            columns[name] = values.reshape(meta["episodes"], *spec["shape"])
-        coded = {name: spec for name, spec in meta["columns"].items() if "quantum" in spec}
-        return codec.assemble(KINDS[kind], codec.decode(columns, coded))
+        return codec.assemble(KINDS[kind], _decoded(path, meta, meta["columns"]))
+
+
+def read_sizes(path: pathlib.Path) -> np.ndarray:
+    """Return the sizes of the objects in the episodes of a shard, `[B, N, 3]` metres, and read nothing else.
+
+    Raises:
+      UserError: see `read_meta`.
+    """
+    meta = read_meta(path)
+    with _reading(path):
+        return _decoded(path, meta, ["scene.size"])["scene.size"]
+
+
+def _decoded(path: pathlib.Path, meta: dict[str, Any], names: Iterable[str]) -> codec.Columns:
+    """Return columns `[B, ...]` of a shard; one that is stored as a difference has to be among them with the other."""
+    specs = {name: meta["columns"][name] for name in names}
+    table, columns = pq.read_table(path, columns=list(specs), page_checksum_verification=True), {}
+    for name, spec in specs.items():
+        column = table.column(name).combine_chunks()
+        flat = column.flatten()
+        if column.null_count or flat.null_count:
+            raise DamagedShard(path, f"its column {name} has empty places")
+        values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"])
+        columns[name] = values.reshape(meta["episodes"], *spec["shape"])
+    return codec.decode(columns, {name: spec for name, spec in specs.items() if "quantum" in spec})

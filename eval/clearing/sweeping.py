@@ -13,7 +13,7 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import batching, console, geometry, seeds, structs
+from dipn_jax import batching, console, geometry, pages, seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
@@ -148,7 +148,7 @@ def table(values: dict[str, Any]) -> str:
         error = values.get(f"{at}/push_error/moved")
         cells = [drawing.percent(values, f"{at}/{key}") for key in SHOWN]
         rows.append([each, "-" if error is None else f"{error:.3f}", *cells, str(values.get(f"{at}/pushes", "-"))])
-    return drawing.table(head, rows)
+    return pages.table(head, rows)
 
 
 def figure(values: dict[str, Any]) -> Any:

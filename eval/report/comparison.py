@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import files, typed
+from dipn_jax import files, pages, typed
 from dipn_jax.errors import UserError
 
 from .. import drawing
@@ -104,14 +104,14 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     for tables in dict.fromkeys(one.tables for one in all_cleared):
         rows = [one for one in all_cleared if one.tables == tables]
         results, causes = results_and_causes(rows)
-        parts.append(f"<h3>{drawing.escaped(tables)}</h3>{results}")
+        parts.append(f"<h3>{pages.escaped(tables)}</h3>{results}")
         parts.append(f"<p>Why tables were not cleared:</p>{causes}{{course-{tables}}}")
         figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
             place = f"clear-{tables}-{number}"
             figures[place] = _films(one)
             parts.append(
-                f"<h4>{drawing.escaped(one.name)} on {drawing.escaped(tables)}: "
+                f"<h4>{pages.escaped(one.name)} on {pages.escaped(tables)}: "
                 f"the best, the median and the worst table</h4>{{{place}}}"
             )
     parts.append(
@@ -137,7 +137,7 @@ def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> s
         lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in paper.COLUMNS]])
     for method, numbers in published.items():
         lines.append([f"{method}, the paper", "", "", "", *[f"{number:.1f}" for number in numbers]])
-    return drawing.table(head, lines)
+    return pages.table(head, lines)
 
 
 def _cause(one: Cleared, entry: dict[str, Any]) -> str:
@@ -164,7 +164,7 @@ def _causes(rows: list[Cleared]) -> str:
         failed = [entry["name"] for entry in one.episodes if entry["ended"] != "cleared"]
         where = ", ".join(f"{name} ({failed.count(name)})" for name in sorted(set(failed)))
         lines.append([one.name, *counts, where or "-"])
-    return drawing.table(["", *CAUSES.values(), "not cleared"], lines)
+    return pages.table(["", *CAUSES.values(), "not cleared"], lines)
 
 
 def course(one: Cleared, at: np.ndarray) -> np.ndarray:

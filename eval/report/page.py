@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import html
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +12,7 @@ import matplotlib
 matplotlib.use("agg")
 import matplotlib.pyplot as plt
 
-from dipn_jax import files, typed
+from dipn_jax import files, pages, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
 
@@ -30,9 +29,6 @@ _FILMS = {
     "push": arrays.Form("f", ("pushes", 4)),
 }
 """Arrays of the pictures of predictions."""
-_STYLE = """body{font:16px/1.5 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
-table{border-collapse:collapse;margin:1em 0}td,th{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:right}
-td:first-child,th:first-child{text-align:left}img{max-width:100%}h2{margin-top:2em}.note{color:#666}"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,10 +55,8 @@ def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
     for name, figure in figures.items():
         body = body.replace(f"{{{name}}}", drawing.image(figure, out / "pictures" / f"{name}.png"))
     versions = ", ".join(f"{k} {v}" for k, v in files.package_versions().items())
-    page = (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>dipn-jax report</title><style>{_STYLE}</style>'
-        f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {html.escape(versions)}.</p></html>\n'
-    )
+    body = f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {pages.escaped(versions)}.</p>'
+    page = pages.alone("dipn-jax report", body)
     files.write_text(out / "report.html", page)
     files.write_json(out / "metrics.json", values)
     return values
@@ -120,7 +114,7 @@ def _prediction_section(values: dict[str, Any]) -> str:
     head = ["", *[f"{m} {d} {w}" for m in ("1-IoU", "XOR/2") for d in ("5 cm", "10 cm") for w in ("all", "moved")]]
     return (
         f"<h2>Predicting a push</h2><p>{values['pushes']} held-out pushes, {values['objects']} objects in sight, "
-        f"{values['objects_moved/5cm']} moved after 5 cm.</p>{drawing.table(head, rows)}{{prediction}}"
+        f"{values['objects_moved/5cm']} moved after 5 cm.</p>{pages.table(head, rows)}{{prediction}}"
     )
 
 
@@ -129,7 +123,7 @@ def _grasp_section(values: dict[str, Any]) -> str:
     return (
         f"<h2>Grasping</h2><p>{values['attempts']} grasps by GN until {values['scenes']} tables were empty, and "
         f"a random one on each; expected calibration error {values['expected_calibration_error']:.3f}.</p>"
-        f"{drawing.table(['', 'success %'], rows)}"
+        f"{pages.table(['', 'success %'], rows)}"
     )
 
 

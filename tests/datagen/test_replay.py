@@ -44,6 +44,20 @@ def test_a_data_set_is_replayed_exactly(kind: str, data: dict[str, pathlib.Path]
     assert ("held as stored" in lines[0]) == (kind == "grasp")
 
 
+def test_sets_that_were_simulated_differently_are_not_replayed_as_one(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path, call
+) -> None:
+    copy = pathlib.Path(shutil.copytree(data["push"], tmp_path / "push"))
+    path = shards.shard_path(copy, 1)
+    config = shards.read_meta(path)["config"] | {"timestep": 0.001}
+    shards.write_shard(copy, 1, shards.read_shard(path, kind="push"), kind="push", config=config, faults={})
+    (copy / records.MANIFEST).unlink()
+    records.update_manifest(copy)
+    code, _, error = call(copy, "--all")
+    assert code == 2 and error.count("\n") == 1
+    assert "simulated differently (native at 0.001 s, native at its own step)" in error
+
+
 def test_what_is_replayed_is_what_is_stored_to_the_last_bit(data: dict[str, pathlib.Path], engine: Any) -> None:
     """One by one, in another batch than they were made in."""
     for kind in ("push", "grasp"):

@@ -7,8 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import grasp as grasp_task
-from dipn_jax.train import online, rounds
+from dipn_jax.train import online, rounds, split
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_step
 from dipn_jax.train.optimizers import make_optimizer
@@ -168,7 +167,7 @@ def test_learning_online_continues_where_it_was_stopped(engine: Any, tmp_path: p
 
 def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig())
-    wide = grasp_task._widened(task.train_set, 7)
+    wide = split.widened(task.train_set, 7)
     assert wide.scene.shape.shape[1] == 7 and (wide.scene.shape[:, 3:] == -1).all()
     for a, b in zip(task.prepare(wide).height, task.prepare(task.train_set).height, strict=True):
         np.testing.assert_array_equal(a, b)

@@ -19,7 +19,7 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.storage import accounting, checkpoint, layout, records, shards
 from experiments import fuzzing
 
-META = {"columns": {}, "schema_version": 2}
+META = {"columns": {}, "schema_version": shards.SCHEMA_VERSION}
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ DAMAGE: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "a dtype that is none": (_meta("columns", "fault", "dtype", to="object"), "fault.dtype is object, want one of"),
     "another shape": (_meta("columns", "after", "shape", to=[7, 3]), r"its column after has shape \[7, 3\], want N 7"),
     "other slots": (_meta("columns", "scene.mass", "shape", to=[4]), r"scene.mass has shape \[4\], want N with"),
-    "no quantum": (_meta("columns", "poses", "quantum"), "poses is int32 with quantum None and code delta, want"),
+    "no quantum": (_meta("columns", "poses", "quantum"), "poses is int32 with quantum None and code value, want"),
     "a huge quantum": (_meta("columns", "poses", "quantum", to=1e300), "with a quantum from 0 to 1"),
     "another code": (
         _meta("columns", "scene.mass", "code", to="delta"),

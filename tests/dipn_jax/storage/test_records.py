@@ -11,7 +11,7 @@ import pytest
 
 from dipn_jax import files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import records, shards
+from dipn_jax.storage import codec, records, shards
 
 
 @pytest.fixture
@@ -78,12 +78,34 @@ def test_the_wrong_kind_a_missing_and_an_old_data_set_are_named(copy: pathlib.Pa
 
 
 def test_another_schema_version_is_named(copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "SCHEMA_VERSION", 99)
-    with pytest.raises(UserError, match="schema version 2, want 99"):
+    monkeypatch.setattr(shards, "READABLE", (2, 99))
+    with pytest.raises(UserError, match="schema version 3, want 2 or 99"):
         shards.read_shard(shards.shard_path(copy, 0), kind="push")
-    with pytest.raises(UserError, match="schema version 2, want 99"):
+    with pytest.raises(UserError, match="schema version 3, want 2 or 99"):
         records.repair(copy)
     assert shards.shard_path(copy, 0).exists(), "what is only old is not set aside"
+
+
+def test_a_shard_of_version_2_is_read_and_stands_beside_new_ones(copy: pathlib.Path) -> None:
+    """Kept: five pushes of seven slots, their poses as differences in time, and the numbers that they stand for."""
+    kept = pathlib.Path(__file__).parent / "kept"
+    folder = copy.parent / "old"
+    folder.mkdir()
+    shutil.copy(kept / "push-v2.parquet", shards.shard_path(folder, 0))
+    meta = shards.read_meta(shards.shard_path(folder, 0))
+    assert meta["schema_version"] == 2 and meta["columns"]["poses"]["code"] == "delta"
+    old = shards.read_shard(shards.shard_path(folder, 0), kind="push")
+    with np.load(kept / "push-v2.npz", allow_pickle=False) as wanted:
+        for name, value in codec.columns(old).items():
+            np.testing.assert_array_equal(value, wanted[name], err_msg=name)
+    shards.write_shard(folder, 1, old, kind="push", config={}, faults={})
+    meta = shards.read_meta(shards.shard_path(folder, 1))
+    assert meta["schema_version"] == 3 and meta["columns"]["poses"]["code"] == "value"
+    records.update_manifest(folder)
+    assert records.verify(folder) == []
+    both, _ = records.load(folder, kind="push")
+    np.testing.assert_array_equal(both.poses[:5], both.poses[5:])
+    np.testing.assert_array_equal(both.after[:5], both.after[5:])
 
 
 def test_a_folder_that_is_no_data_set_is_left_alone(tmp_path: pathlib.Path) -> None:

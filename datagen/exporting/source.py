@@ -1,0 +1,134 @@
+"""A data set as an export reads it: shard by shard, with the numbers of episodes and scenes, and what is held out."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from dipn_jax import structs, typed
+from dipn_jax.errors import UserError
+from dipn_jax.storage import held_out, records, shards
+
+SPLITS = ("train", "test")
+"""Names of what is learnt from and what is held out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shard:
+    """A shard, and what comes before it in the data set."""
+
+    path: pathlib.Path
+    count: int  # episodes
+    first: int  # number of its first episode
+    scene: int  # number of the scene of its first episode
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """The episodes of a shard that belong to one split; an export is written a part at a time."""
+
+    split: str
+    number: int  # among the parts of the split
+    place: int  # among all parts
+    shard: Shard
+    rows: slice  # of the shard
+    first: int  # number of its first episode among those of the split
+
+    @property
+    def name(self) -> str:
+        """A name for files: parts sorted by it are in order."""
+        return f"{self.split}-{self.number:05d}"
+
+    @property
+    def count(self) -> int:
+        """The number of its episodes."""
+        return int(self.rows.stop - self.rows.start)
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A data set that has been checked."""
+
+    folder: pathlib.Path
+    kind: str
+    slots: int  # N
+    shards: tuple[Shard, ...]
+    cut: int  # number of the first episode that is held out
+    fingerprint: str
+
+    @property
+    def count(self) -> int:
+        """The number of episodes."""
+        return sum(shard.count for shard in self.shards)
+
+    def episodes(self, split: str) -> range:
+        """Return the numbers of the episodes of a split."""
+        return range(0, self.cut) if split == "train" else range(self.cut, self.count)
+
+    def parts(self) -> list[Part]:
+        """Return what an export consists of, in the order of the episodes."""
+        found: list[Part] = []
+        for split in SPLITS:
+            wanted, number = self.episodes(split), 0
+            for shard in self.shards:
+                begin, end = max(wanted.start, shard.first), min(wanted.stop, shard.first + shard.count)
+                if begin < end:
+                    rows = slice(begin - shard.first, end - shard.first)
+                    found.append(Part(split, number, len(found), shard, rows, begin - wanted.start))
+                    number += 1
+        return found
+
+    def read(self, part: Part) -> tuple[Any, np.ndarray, np.ndarray]:
+        """Return the episodes `[B]` of a part, their numbers `[B]`, and the numbers of their scenes `[B]`."""
+        episodes = shards.read_shard(part.shard.path, kind=self.kind)
+        begun = np.zeros(part.shard.count, np.int64)
+        begun[held_out.begins(np.asarray(episodes.scene.size))] = 1
+        numbers = part.shard.first + np.arange(part.shard.count, dtype=np.int64)
+        scenes = part.shard.scene + np.cumsum(begun) - 1
+        return structs.take(episodes, part.rows), numbers[part.rows], scenes[part.rows]
+
+
+def open_source(folder: pathlib.Path) -> Source:
+    """Check a data set, and find where its scenes begin and what of it training holds out.
+
+    Raises:
+      UserError: there is none, it is damaged, or it cannot be split.
+    """
+    kind = str(records.summary(folder)["kind"])
+    manifest = records.checked(folder, kind=kind)
+    found = _surveyed(folder, manifest)
+    widths = {_slots(shard.path) for shard in found}
+    if len(widths) > 1:
+        raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
+    count = sum(shard.count for shard in found)
+    cut = held_out.cut((shards.read_sizes(shard.path) for shard in found), count, folder)
+    return Source(folder, kind, widths.pop(), found, cut, records.fingerprint(manifest))
+
+
+def _slots(path: pathlib.Path) -> int:
+    return int(shards.read_meta(path)["columns"]["scene.shape"]["shape"][0])
+
+
+def _surveyed(folder: pathlib.Path, manifest: dict[str, Any]) -> tuple[Shard, ...]:
+    """Return the shards of a data set in order, with their first episodes and scenes."""
+    found: list[Shard] = []
+    first = begun = 0
+    before: np.ndarray | None = None
+    for name in manifest["shards"]:
+        size = shards.read_sizes(typed.inside(folder, name))
+        same = before is not None and before.shape == size[0].shape
+        rows = held_out.begins(size, before=before if same else None)
+        goes_on = len(rows) == 0 or rows[0] != 0
+        found.append(Shard(folder / name, len(size), first, begun - 1 if goes_on else begun))
+        first, begun, before = first + len(size), begun + len(rows), size[-1]
+    return tuple(found)
+
+
+def blocks(count: int, size: int) -> Iterator[slice]:
+    """Return the slices of `count` rows, `size` at a time."""
+    for begin in range(0, count, size):
+        yield slice(begin, min(begin + size, count))

@@ -1,0 +1,36 @@
+"""The command `dipn-datagen merge`. Importing this imports no JAX."""
+
+from __future__ import annotations
+
+import pathlib
+
+import tyro
+
+from dipn_jax import console
+from dipn_jax.errors import UserError
+
+
+def merge(folders: tyro.conf.Positional[tuple[pathlib.Path, ...]], out: pathlib.Path | None = None) -> None:
+    """Join data sets of one kind: shards that workers made on several disks, or sets that were made apart.
+
+    Shards are copied as they are. Those of one configuration keep their numbers, and what is still missing of the
+    data set is said; others are numbered anew, and what differs between them is said:
+      dipn-datagen merge /disk1/push /disk2/push --out data/push
+
+    Shards that were copied into a data set by hand are checked and listed:
+      dipn-datagen merge data/push
+
+    Args:
+      folders: two data sets or more; or one, in which shards are to be listed.
+      out: folder of the joined data set; the same command continues where it stopped.
+    """
+    if not folders or (out is None) != (len(folders) == 1):
+        raise UserError(f"merge: {len(folders)} folders {'without' if out is None else 'with'} --out; want two or more "
+                        "with --out, or one without, in which copied shards are to be listed")  # fmt: skip
+    from . import merging
+
+    if out is None:
+        merging.gather(folders[0])
+    else:
+        console.require_out(out)
+        merging.merge(folders, out)

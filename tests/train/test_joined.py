@@ -1,0 +1,66 @@
+"""Several data sets for one training."""
+
+import pathlib
+
+import numpy as np
+import pytest
+from dipn_jax.train import cli
+from dipn_jax.train.grasp import PretrainTask
+from dipn_jax.train.push import PushTask
+from dipn_jax.train.split import load_sides, widened
+
+from dipn_jax import console, structs
+from dipn_jax.errors import UserError
+from dipn_jax.networks.dipn import DipnConfig
+from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.storage import records, shards
+
+Data = dict[str, pathlib.Path]
+
+
+@pytest.fixture
+def wider(data: Data, tmp_path: pathlib.Path) -> Data:
+    """Return data sets with the episodes of `data` in five slots instead of three."""
+    made = {}
+    for kind in ("push", "images"):
+        made[kind] = tmp_path / f"wider-{kind}"
+        made[kind].mkdir()
+        episodes = widened(records.load(data[kind], kind=kind)[0], 5)
+        shards.write_shard(made[kind], 0, episodes, kind=kind, config={}, faults={})
+        records.update_manifest(made[kind])
+    return made
+
+
+def test_pushes_of_several_data_sets_are_learnt_from(data: Data, wider: Data) -> None:
+    task = PushTask((data["push"], wider["push"]), DipnConfig(), limit=None, centimetres=(5, 10))
+    assert task.size == 40 and len(task.test_set.fault) == 8 and task.slots == 5
+    one, other = (task.prepare(structs.take(task.train_set, slice(at, at + 2))) for at in (0, 20))
+    np.testing.assert_array_equal(one.inputs.crops, other.inputs.crops)
+    np.testing.assert_array_equal(one.target, other.target)
+    assert not np.asarray(one.inputs.present)[:, 3:].any()
+    alone = PushTask(data["push"], DipnConfig(), limit=None, centimetres=(5, 10))
+    assert task.fingerprint.startswith(alone.fingerprint.split(":")[0]) and task.fingerprint != alone.fingerprint
+    fewer = PushTask((data["push"], wider["push"]), DipnConfig(), limit=3, centimetres=(5,))
+    np.testing.assert_array_equal(fewer.train_set.poses, task.train_set.poses[:3])
+
+
+def test_the_last_tenth_of_each_is_held_out(data: Data, wider: Data) -> None:
+    sides = load_sides((data["push"], wider["push"]), kind="push")
+    half = np.split(sides.held_out.poses, 2)
+    np.testing.assert_array_equal(half[0][:, :, :3], half[1][:, :, :3])
+    np.testing.assert_array_equal(half[0][:, :, :3], records.load(data["push"], kind="push")[0].poses[20:])
+
+
+def test_images_of_several_data_sets_are_learnt_from(data: Data, wider: Data) -> None:
+    task = PretrainTask((data["images"], wider["images"]), GraspConfig(width=8))
+    assert task.size == 6 and task.examples == 8 and len(task.test_set.fault) == 2
+
+
+def test_the_command_takes_several_folders_and_names_the_one_that_is_wrong(
+    data: Data, wider: Data, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["push", "--data", str(wider["push"]), str(data["grasp"]), "--out", str(tmp_path / "r")]
+    assert console.run("dipn-train", cli.COMMANDS, words) == 2
+    assert "holds grasp episodes, want push" in capsys.readouterr().err
+    with pytest.raises(UserError, match="want at least one folder of dipn-datagen push"):
+        load_sides((), kind="push")
