@@ -12,6 +12,7 @@ from dipn_jax.datagen import cli, replay
 
 from dipn_jax import console, machine, structs
 from dipn_jax.storage import codec, records, shards
+from dipn_jax.storage.manifest import MANIFEST, update_manifest
 
 
 @pytest.fixture
@@ -31,8 +32,8 @@ def rewritten(folder: pathlib.Path, out: pathlib.Path, change: Any) -> pathlib.P
     meta = shards.read_meta(path)
     episodes = change(shards.read_shard(path, kind=meta["kind"]))
     shards.write_shard(copy, 0, episodes, kind=meta["kind"], config=meta["config"], faults=meta["faults"])
-    (copy / records.MANIFEST).unlink()
-    records.update_manifest(copy)
+    (copy / MANIFEST).unlink()
+    update_manifest(copy)
     return copy
 
 
