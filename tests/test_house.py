@@ -26,10 +26,9 @@ TOPS = ("benchmarks", "experiments")
 MOST_LINES = 300
 """Largest number of lines in a file."""
 # library modules in the order of the arrows: each may import only what stands before it
-ORDER = [
-    "errors", "names", "seeds", "typed", "interruption", "forking", "files", "console", "machine", "structs",
-    "workspace", "geometry", "batching", "engine", "world", "physics", "sight", "networks", "storage", "planning",
-]  # fmt: skip
+ORDER = ["errors", "names", "command_words", "seeds", "typed", "interruption", "forking", "files", "console", "machine",
+         "launch", "structs", "workspace", "geometry", "batching", "engine", "world", "physics", "sight", "networks",
+         "storage", "planning"]  # fmt: skip
 
 
 def _imports(path: pathlib.Path) -> set[str]:
