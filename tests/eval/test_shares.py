@@ -122,6 +122,7 @@ def test_what_does_not_belong_together_is_one_line(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     first, second = _parts(evaluated("clear"))
+    capfd.readouterr()
     both = change.pop("both", False)
     if change.get("named", "") is None:
         change["named"] = shares.read(second).named | {"seed": "7"}
@@ -166,6 +167,7 @@ def test_a_missing_part_is_named_with_the_command_that_makes_it(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     only = pathlib.Path(shutil.copytree(_parts(evaluated(kind))[1], tmp_path / "part-1-of-2"))
+    capfd.readouterr()
     assert _run("merge", only, "--out", tmp_path / "out") == 2
     said = capfd.readouterr().err
     assert said.startswith("error: shard 0 of 2 missing: run `dipn-eval ") and said.count("\n") == 1
