@@ -8,8 +8,9 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from dipn_jax import console
+from dipn_jax import command_words, console
 from dipn_jax.errors import UserError
+from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
@@ -40,17 +41,41 @@ class Work:
     threads: int | None = None
     """Threads that native simulates on, one a core if not given; shards are then made one at a time."""
 
+    launch: Launch = LOCAL
+    """Where the shards are made."""
+
+    def __post_init__(self) -> None:
+        if self.launch.spreads and self.of > 1:
+            raise UserError("--launcher ray makes all shards: leave out --shard and --of")
+
 
 DEFAULT_WORK = Work()
 """One worker that makes everything, with the engine that is faster here."""
+
+OWN = ("out", "shard", "of", "threads", "launcher", "num_cpus", "num_gpus")
+"""Options that every worker has of its own."""
 
 
 def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *, scorer: Scorer | None = None) -> None:
     """Generate what `job` says; `given` are the options that the command was called with, to be kept."""
     from .generate import generate
 
-    command = upkeep.words(COMMANDS[job.kind], given, without=("out", "shard", "of", "threads"))
-    generate(job, out, part=work.shard, of=work.of, threads=work.threads, scorer=scorer, command=(job.kind, *command))
+    command = command_words.words(COMMANDS[job.kind], given, without=OWN)
+    elsewhere = None
+    if work.launch.spreads:
+        from . import spread
+
+        elsewhere = spread.elsewhere(work.launch, threads=work.threads, network=given.get("grasp_net"))
+    generate(
+        job,
+        out,
+        part=work.shard,
+        of=work.of,
+        threads=work.launch.threads(work.threads),
+        scorer=scorer,
+        command=(job.kind, *command),
+        elsewhere=elsewhere,
+    )
 
 
 def push(
@@ -71,6 +96,9 @@ def push(
 
     The same pushes at three distances, each ended by its own retreat:
       dipn-datagen push --out data/sweep --distances 0.03 0.06 0.1 --shard-size 300
+
+    As tasks of a Ray cluster, each a shard:
+      dipn-datagen push --out data/million --episodes 1000000 --launcher ray --num-cpus 4
 
     Args:
       out: folder of the data set; the same command continues, more --episodes extend it.

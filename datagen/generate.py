@@ -6,12 +6,13 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import json
 import pathlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 import jax
@@ -23,7 +24,7 @@ from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine, resolve
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
-from dipn_jax.storage import accounting, records, shards
+from dipn_jax.storage import accounting, manifest, shards
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 
@@ -85,6 +86,10 @@ class Job:
         return min(self.shard_size, self.episodes - index * self.shard_size)
 
 
+Elsewhere = Callable[[Job, Sequence[int], pathlib.Path], Generator[tuple[str, dict[str, Any]], None, None]]
+"""(job, numbers of shards, folder) -> name and entry of each shard, in any order, when it is written."""
+
+
 class _Tally:
     """Counts of all shards of this run, shown beside the progress bar. Threads share it."""
 
@@ -112,7 +117,7 @@ def _maker(job: Job, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
 
 
 def shard(
-    job: Job, index: int, engine: Engine, tally: _Tally, scorer: Scorer | None = None
+    job: Job, index: int, engine: Engine, tally: _Tally | None = None, scorer: Scorer | None = None
 ) -> tuple[Any, dict[str, int]]:
     """Return the episodes of one shard and the counts of the batches that they are from."""
     want = job.size(index)
@@ -135,7 +140,8 @@ def shard(
         if fresh:
             done.append(structs.take(batch.episodes, slice(0, fresh)))
         have += fresh
-        tally.add(fresh, batch.counts)
+        if tally is not None:
+            tally.add(fresh, batch.counts)
     return structs.concatenate(done), dict(counts)
 
 
@@ -148,6 +154,7 @@ def generate(
     threads: int | None = None,
     scorer: Scorer | None = None,
     command: Sequence[str] | None = None,
+    elsewhere: Elsewhere | None = None,
 ) -> None:
     """Write the shards of `job` that are missing; worker `part` of `of` workers takes every `of`-th.
 
@@ -161,6 +168,7 @@ def generate(
       threads: that `native` simulates on; shards are then made one at a time, so that no more are used.
       scorer: the network of `job.weights`, for guided and hard grasps.
       command: what makes the data set, as `accounting.note` keeps it.
+      elsewhere: makes the shards on other machines; all are made here if not given.
 
     Raises:
       UserError: the folder holds a data set of another config.
@@ -175,25 +183,53 @@ def generate(
     if command is not None:
         accounting.note(out, command, of=of)
     mine = range(part, job.shards(), of)
-    todo = [index for index in mine if not _written(out, index, job)]
+    todo = [index for index in mine if not written(out, index, job)]
     total = sum(map(job.size, mine))
-    with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
-        _write_all(job, todo, out, engine, _Tally(progress), scorer, at_once=1 if threads else SHARDS_AT_ONCE)
-    manifest = records.update_manifest(out)
-    console.say(f"{out}: {manifest['episodes']} {job.kind} episodes in {len(manifest['shards'])} shards")
+    manifest.forget(out, {shards.shard_path(out, index).name for index in todo})
+    made: dict[str, Any] = {}
+    try:
+        with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
+            tally = _Tally(progress)
+            if elsewhere is None:
+                at_once = 1 if threads else SHARDS_AT_ONCE
+                _write_all(job, todo, out, engine, tally, scorer, made, at_once=at_once)
+            else:
+                _gather(elsewhere(job, todo, out), tally, made)
+    except BaseException:
+        with contextlib.suppress(UserError, OSError):  # what ended the work is said
+            manifest.update_manifest(out, made=made)
+        raise
+    listed = manifest.update_manifest(out, made=made)
+    console.say(f"{out}: {listed['episodes']} {job.kind} episodes in {len(listed['shards'])} shards")
+
+
+def _gather(finished: Generator[tuple[str, dict[str, Any]], None, None], tally: _Tally, made: dict[str, Any]) -> None:
+    """Take the entries of shards that are made elsewhere, as they are finished, into `made`."""
+    with contextlib.closing(finished):
+        for name, entry in finished:
+            made[name] = entry
+            tally.add(entry["episodes"], entry["faults"])
 
 
 def _write_all(
-    job: Job, todo: list[int], out: pathlib.Path, engine: Engine, tally: _Tally, scorer: Scorer | None, *, at_once: int
+    job: Job,
+    todo: list[int],
+    out: pathlib.Path,
+    engine: Engine,
+    tally: _Tally,
+    scorer: Scorer | None,
+    made: dict[str, Any],
+    *,
+    at_once: int,
 ) -> None:
-    """Make and write the shards `todo`, `at_once` at a time; the first error stops all."""
-    # the content of a shard does not depend on how many others there are
-    config = {key: value for key, value in job.describe().items() if key != "episodes"}
+    """Make and write the shards `todo`, `at_once` at a time; the first error stops all.
+
+    `made` gets the entries of the shards in the manifest, by name.
+    """
 
     def one(index: int) -> None:
-        made, counts = shard(job, index, engine, tally, scorer)
-        shards.write_shard(out, index, made, kind=job.kind, config=config, faults=counts)
-        records.update_manifest(out)
+        name, entry = write_one(job, index, out, engine, tally, scorer)
+        made[name] = entry
 
     with concurrent.futures.ThreadPoolExecutor(at_once) as pool:
         futures: list[concurrent.futures.Future[None]] = []
@@ -208,7 +244,18 @@ def _write_all(
             raise
 
 
-def _written(out: pathlib.Path, index: int, job: Job) -> bool:
+def write_one(
+    job: Job, index: int, out: pathlib.Path, engine: Engine, tally: _Tally | None, scorer: Scorer | None
+) -> tuple[str, dict[str, Any]]:
+    """Make and write one shard; return its name and its entry in the manifest."""
+    # the content of a shard does not depend on how many others there are
+    config = {key: value for key, value in job.describe().items() if key != "episodes"}
+    episodes, counts = shard(job, index, engine, tally, scorer)
+    entry = shards.write_shard(out, index, episodes, kind=job.kind, config=config, faults=counts)
+    return shards.shard_path(out, index).name, entry
+
+
+def written(out: pathlib.Path, index: int, job: Job) -> bool:
     """Return whether shard `index` is there with all its episodes; a shorter one is made anew."""
     path = shards.shard_path(out, index)
     return path.exists() and shards.count(path) == job.size(index)

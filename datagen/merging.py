@@ -11,7 +11,7 @@ from typing import Any
 
 from dipn_jax import console, files, typed
 from dipn_jax.errors import UserError
-from dipn_jax.storage import accounting, owner, records, shards
+from dipn_jax.storage import accounting, manifest, owner, records, shards
 
 MOST_SAID = 400
 """Characters of what differs between two data sets that are shown at most."""
@@ -64,8 +64,8 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> None:
 
 def _entries(folder: pathlib.Path) -> list[Entry]:
     """Return the shards of a data set, each of which is whole."""
-    manifest = records.whole(folder, kind=str(records.summary(folder)["kind"]))
-    paths = {typed.inside(folder, name): entry["sha256"] for name, entry in manifest["shards"].items()}
+    found = records.whole(folder, kind=str(records.summary(folder)["kind"]))
+    paths = {typed.inside(folder, name): entry["sha256"] for name, entry in found.items()}
     return [Entry(path, sha256, shards.read_meta(path)) for path, sha256 in paths.items()]
 
 
@@ -131,7 +131,7 @@ def _copy(entries: dict[str, Entry], out: pathlib.Path) -> None:
             with files.replacing(out / name) as path:
                 shutil.copyfile(entries[name].path, path)
             progress.advance(1)
-    records.update_manifest(out)
+    manifest.update_manifest(out)
 
 
 def _say(sets: dict[pathlib.Path, list[Entry]], out: pathlib.Path) -> None:
@@ -167,7 +167,7 @@ def gather(folder: pathlib.Path) -> None:
     Raises:
       UserError: a shard is damaged, or of another configuration than the others, or its episodes are there twice.
     """
-    if not (folder / "config.json").is_file() and not (folder / records.MANIFEST).is_file():
+    if not (folder / "config.json").is_file() and not (folder / manifest.MANIFEST).is_file():
         raise UserError(f"data set {folder}: no such data set; give a folder that dipn-datagen wrote")
     paths = shards.shard_files(folder)
     entries = [Entry(path, files.file_sha256(path), shards.read_meta(path)) for path in paths]
@@ -186,7 +186,7 @@ def gather(folder: pathlib.Path) -> None:
     _refuse_twice(entries)
     for entry in entries:
         shards.read_shard(entry.path, kind=entry.meta["kind"])
-    manifest = records.update_manifest(folder)
+    listed = manifest.update_manifest(folder)
     if missing := records.missing(folder):
         console.warn(missing)
-    console.say(f"{folder}: {manifest['episodes']} {manifest['kind']} episodes in {len(manifest['shards'])} shards")
+    console.say(f"{folder}: {listed['episodes']} {listed['kind']} episodes in {len(listed['shards'])} shards")

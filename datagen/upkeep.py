@@ -1,13 +1,9 @@
-"""The commands that look after a data set: verify, repair and info; and the words of a command that makes one."""
+"""The commands that look after a data set: verify, repair and info."""
 
 from __future__ import annotations
 
-import dataclasses
-import inspect
 import json
 import pathlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
 
 import tyro
 
@@ -32,7 +28,10 @@ def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     problems = records.verify(folder)
     if problems:
         path, what = problems[0]
-        raise UserError(f"{path}: {what} ({len(problems)} such in all); {records.advice(folder, problems)}")
+        raise UserError(
+            f"{path}: {what} ({len(problems)} shards wrong in all); run dipn-datagen repair {folder}, then generate "
+            "again"
+        )
     if said := records.missing(folder):
         raise UserError(said)
     console.say(f"{folder}: all shards are whole")
@@ -87,28 +86,3 @@ def info(
     for said in (mixed and f"{folder}: {mixed}", summary["missing"]):
         if said:
             console.warn(said)
-
-
-def words(command: Callable[..., Any], given: Mapping[str, Any], *, without: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the words after a command's name that give it the options `given`; those at their default are left out.
-
-    Args:
-      command: a function of the command line.
-      given: its arguments by name.
-      without: options to be left out.
-    """
-    found: list[str] = []
-    for name, parameter in inspect.signature(command).parameters.items():
-        for option, value in _changed(name, given[name], parameter.default):
-            if option not in without:
-                found += [f"--{option.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return tuple(found)
-
-
-def _changed(name: str, value: Any, default: Any) -> Iterator[tuple[str, Any]]:
-    """Return the options of an argument that are not at their default: itself, or fields of the struct that it is."""
-    if dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            yield from _changed(field.name, getattr(value, field.name), getattr(default, field.name))
-    elif value != default:
-        yield name, value

@@ -232,9 +232,7 @@ def exit_code(work: Callable[[], int | None]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(
-            f"error: {error.filename or 'files'}: {error.strerror or error}; mend that and try again", file=sys.stderr
-        )
+        print(f"error: {mended(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted: run the same command again to continue from here", file=sys.stderr)
@@ -245,6 +243,11 @@ def exit_code(work: Callable[[], int | None]) -> int:
             raise
         print(f"error: {missing}", file=sys.stderr)
         return 2
+
+
+def mended(error: OSError) -> str:
+    """Return the line that says which file the user has to mend."""
+    return f"{error.filename or 'files'}: {error.strerror or error}; mend that and try again"
 
 
 def _missing_device() -> str | None:

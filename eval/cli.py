@@ -1,4 +1,4 @@
-"""The program `dipn-eval`: prediction, grasp, clear, sweep, report."""
+"""The program `dipn-eval`: prediction, grasp, clear, sweep, merge, report."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 
 from dipn_jax import console
 
+from . import merging
 from .clearing import command as clearing
 from .clearing import sweep_command as sweeping
 from .grasping import command as grasping
@@ -17,6 +18,7 @@ COMMANDS = {
     "grasp": grasping.grasp,
     "clear": clearing.clear,
     "sweep": sweeping.sweep,
+    "merge": merging.merge,
     "report": report.report,
 }
 """The commands of `dipn-eval`, by name."""

@@ -21,7 +21,7 @@ def check(out: pathlib.Path, seed: int, **counts: int) -> None:
 
 def settings(given: dict[str, Any]) -> dict[str, Any]:
     """The options of a command by name, without those on which no result depends."""
-    return {key: value for key, value in given.items() if key != "threads"}
+    return {key: value for key, value in given.items() if key not in ("threads", "share", "launch")}
 
 
 def plain(value: Any) -> Any:
@@ -48,5 +48,10 @@ def finish(out: pathlib.Path, values: dict[str, Any], settings: dict[str, Any], 
 
     metrics.write(out, values, settings=recorded(settings, partial))
     partial.finish()
+    show(values)
+
+
+def show(values: dict[str, Any]) -> None:
+    """Print metrics, one on a line."""
     for name, value in values.items():
         console.say(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")

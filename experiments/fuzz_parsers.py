@@ -20,6 +20,7 @@ from dipn_jax.eval.report import comparison
 from dipn_jax import files, structs
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, checkpoint, records, resume, shards
+from dipn_jax.storage.manifest import MANIFEST, update_manifest
 from dipn_jax.structs import Grasp, GraspEpisode, Push, PushEpisode, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import cases
@@ -71,7 +72,7 @@ def data_set(folder: pathlib.Path, *, kind: str = "push", number: int = 2) -> No
         shards.write_shard(folder, index, episodes(kind), kind=kind, config=config, faults={"dropped_scenes": 1})
     files.write_json(folder / "config.json", config)
     accounting.note(folder, [kind, "--episodes", "6"], of=3)
-    records.update_manifest(folder)
+    update_manifest(folder)
 
 
 def _look_at_data(folder: pathlib.Path) -> None:
@@ -239,9 +240,9 @@ def _one_shard(folder: pathlib.Path) -> None:
 
 def _look_at_shard(folder: pathlib.Path) -> None:
     """Read a shard, and list it in a manifest."""
-    (folder / records.MANIFEST).unlink(missing_ok=True)
+    (folder / MANIFEST).unlink(missing_ok=True)
     shards.read_shard(folder / "shard-00000.parquet", kind="push")
-    records.update_manifest(folder)
+    update_manifest(folder)
     records.summary(folder)
 
 

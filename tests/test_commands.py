@@ -199,7 +199,7 @@ def test_commands_without_threads_are_those_that_simulate_nothing() -> None:
     assert without == {
         "datagen": {"verify", "repair", "info", "export", "merge"},
         "train": {"push", "grasp-pretrain", "grasp", "export"},
-        "eval": {"report"},
+        "eval": {"merge", "report"},
     }
 
 

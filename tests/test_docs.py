@@ -42,7 +42,7 @@ ALWAYS = {
 MAINTENANCE = ("info", "verify", "repair", "export", "replay")
 """Commands that make and learn nothing, and take none of those options."""
 RUN = {
-    "many_workers.md": ("push", *MAINTENANCE),
+    "data_sets.md": ("push", *MAINTENANCE),
     "your_network.md": ("push", "images", "export"),
     "weights_elsewhere.md": ("export",),
     "sweep_distance.md": ("push",),
@@ -180,7 +180,7 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
         assert names["kernel"].shape == (3, 3, 64, 24) and names["about"]["network"] == "grasp"
     elif page.name == "other_tools.md":
         assert names["pushes"].num_rows == 24 and names["some"]["height_before"].shape[1:] == (224, 224)
-    elif page.name == "many_workers.md":
+    elif page.name == "data_sets.md":
         assert names["episodes"].poses.shape[:2] == (24, 11)
         wanted = render.render(names["pushes"].scene[3], names["pushes"].poses[3, 0])
         np.testing.assert_array_equal(names["seen"][3].height, wanted.height)

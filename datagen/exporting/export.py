@@ -14,7 +14,7 @@ import numpy as np
 
 from dipn_jax import console, files, structs
 from dipn_jax.errors import UserError
-from dipn_jax.storage import owner, records
+from dipn_jax.storage import manifest, owner, records
 
 from . import columns, drawn, steps
 from .card import card
@@ -56,7 +56,7 @@ def export(data: pathlib.Path, out: pathlib.Path, *, form: str, images: str, com
     console.require_out(out)
     if missing := [name for name in NEEDS.get(form, ()) if importlib.util.find_spec(name) is None]:
         raise UserError(f"--format {form}: needs {' and '.join(missing)}; run pip install 'dipn-jax[export]'")
-    if (out / records.MANIFEST).exists():
+    if (out / manifest.MANIFEST).exists():
         raise UserError(f"--out {out}: holds a data set; give another folder")
     kind = str(records.summary(data)["kind"])
     _suits(kind, form, images)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -99,26 +99,26 @@ def open_source(folder: pathlib.Path) -> Source:
       UserError: there is none, it is damaged, or it cannot be split.
     """
     kind = str(records.summary(folder)["kind"])
-    manifest = records.checked(folder, kind=kind)
-    found = _surveyed(folder, manifest)
+    entries = records.checked(folder, kind=kind)
+    found = _surveyed(folder, entries)
     widths = {_slots(shard.path) for shard in found}
     if len(widths) > 1:
         raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
     count = sum(shard.count for shard in found)
     cut = held_out.cut((shards.read_sizes(shard.path) for shard in found), count, folder)
-    return Source(folder, kind, widths.pop(), found, cut, records.fingerprint(manifest))
+    return Source(folder, kind, widths.pop(), found, cut, records.fingerprint(entries))
 
 
 def _slots(path: pathlib.Path) -> int:
     return int(shards.read_meta(path)["columns"]["scene.shape"]["shape"][0])
 
 
-def _surveyed(folder: pathlib.Path, manifest: dict[str, Any]) -> tuple[Shard, ...]:
+def _surveyed(folder: pathlib.Path, names: Iterable[str]) -> tuple[Shard, ...]:
     """Return the shards of a data set in order, with their first episodes and scenes."""
     found: list[Shard] = []
     first = begun = 0
     before: np.ndarray | None = None
-    for name in manifest["shards"]:
+    for name in names:
         size = shards.read_sizes(typed.inside(folder, name))
         same = before is not None and before.shape == size[0].shape
         rows = held_out.begins(size, before=before if same else None)

@@ -137,7 +137,12 @@ def _command(folder: pathlib.Path, gaps: Sequence[int], *, every: bool) -> str:
     workers = {index % found["of"] for index in gaps}
     if found["of"] > 1 and len(workers) == 1 and every:
         command += ["--shard", str(min(workers)), "--of", str(found["of"])]
-    return f"`{typed.one_line(shlex.join(command), most=MOST_SHOWN)}`"
+    return quoted(command)
+
+
+def quoted(words: Sequence[str]) -> str:
+    """Return a command on one line, as a shell reads it, in backticks."""
+    return f"`{typed.one_line(shlex.join(words), most=MOST_SHOWN)}`"
 
 
 def makers(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import pathlib
 from collections.abc import Mapping
 
@@ -17,6 +18,13 @@ class Form:
 
     kinds: str  # kinds of NumPy: f float, i int, u unsigned, b bool, U text
     shape: tuple[int | str, ...]  # lengths, or the name of one: the same in all arrays of a file
+
+
+def dumps(named: Mapping[str, np.ndarray]) -> bytes:
+    """Return arrays as the bytes of a file that `read` reads."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, **named)
+    return stream.getvalue()
 
 
 def read(path: pathlib.Path, wanted: Mapping[str, Form]) -> dict[str, np.ndarray]:

@@ -1,8 +1,7 @@
-"""Data sets: folders of shards (`shards`) with a `manifest.json` that lists them and their SHA-256."""
+"""Data sets: folders of shards (`shards`), most of which a manifest lists (`manifest`)."""
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import pathlib
@@ -11,104 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import console, files, typed
+from dipn_jax import console, files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import accounting, layout, shards
+from dipn_jax.storage import accounting, manifest, shards
+from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
-MANIFEST = "manifest.json"
-"""Name of the file that lists the shards of a data set."""
-UNLISTED = "is not listed in the manifest yet"
-"""What `verify` says of a shard that was copied into the folder."""
-_FORM = {
-    "kind": typed.Maybe(set(layout.KINDS)),
-    "shards": {
-        str: {
-            "episodes": typed.Whole(1),
-            "bytes": typed.Whole(),
-            "sha256": str,
-            "kind": set(layout.KINDS),
-            "faults": {str: typed.Whole()},
-        }
-    },
-}
-"""Form of the manifest."""
-
-
-def update_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """List every readable shard of the folder in `manifest.json`, and return the manifest.
-
-    Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
-    folder take turns, where the system can lock files. Where it cannot, the last one to write looks again whether
-    shards were added while it wrote, so that none stays unlisted.
-    """
-    with (folder / ".lock").open("wb") as lock:
-        try:
-            if fcntl is not None:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-        except OSError:
-            _warn_of_no_locks(folder)
-        manifest = _rebuild_manifest(folder)
-        while set(manifest["shards"]) != {path.name for path in shards.shard_files(folder)}:
-            manifest = _rebuild_manifest(folder)  # somebody whom no lock kept waiting has added a shard
-        return manifest
-
-
-@functools.cache
-def _warn_of_no_locks(folder: pathlib.Path) -> None:
-    """Say once a process that workers cannot take turns."""
-    console.warn(f"{folder}: its file system has no locks; workers list their shards without taking turns")
-
-
-def _rebuild_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """Write the manifest anew, as `update_manifest` says, and return it."""
-    known = _read_manifest(folder)["shards"] if (folder / MANIFEST).exists() else {}
-    entries: dict[str, Any] = {}
-    for path in shards.shard_files(folder):
-        entry = known.get(path.name)
-        if entry is None or entry["bytes"] != path.stat().st_size:
-            meta = shards.read_meta(path)
-            entry = {
-                "episodes": meta["episodes"],
-                "bytes": path.stat().st_size,
-                "sha256": files.file_sha256(path),
-                "kind": meta["kind"],
-                "faults": meta["faults"],
-            }
-        entries[path.name] = entry
-    manifest = {
-        "schema_version": shards.SCHEMA_VERSION,
-        "kind": next((entry["kind"] for entry in entries.values()), None),
-        "episodes": sum(entry["episodes"] for entry in entries.values()),
-        "shards": entries,
-    }
-    files.write_json(folder / MANIFEST, manifest)
-    return manifest
-
-
-def _read_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """Return the manifest of a data set; raise UserError if it is missing or damaged."""
-    path = folder / MANIFEST
-    try:
-        manifest: dict[str, Any] = typed.check(typed.parse(path.read_bytes()), _FORM)
-        for name in manifest["shards"]:
-            if "/" in name or not (name.startswith("shard-") and name.endswith(".parquet")):
-                raise typed.Misfit(f"{typed.brief(name)} is no name of a shard")
-            typed.inside(folder, name)
-    except (FileNotFoundError, NotADirectoryError):
-        raise UserError(f"data set {folder}: no {MANIFEST}; give a folder that dipn-datagen wrote") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); mend that, or give another folder") from None
-    except typed.Misfit as error:
-        raise UserError(
-            f"data set {folder}: {MANIFEST} is damaged; run dipn-datagen repair {folder} ({error})"
-        ) from None
-    return manifest
 
 
 def _problem(path: pathlib.Path, entry: dict[str, Any]) -> str:
@@ -129,11 +35,25 @@ def _problem(path: pathlib.Path, entry: dict[str, Any]) -> str:
 
 
 def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
-    """Return the shards that are missing, damaged or unlisted, each with what is wrong; empty if none is."""
-    listed = _read_manifest(folder)["shards"]
+    """Return the shards that are missing or damaged, each with what is wrong; empty if none is.
+
+    Those that the manifest does not list are read to their end.
+    """
+    listed = manifest.listed(folder)
     checked = [(folder / name, _problem(folder / name, entry)) for name, entry in listed.items()]
-    unlisted = [(path, UNLISTED) for path in shards.shard_files(folder) if path.name not in listed]
-    return [(path, what) for path, what in checked if what] + unlisted
+    checked += [(path, _unreadable(path)) for path in manifest.unlisted(folder, listed)]
+    return [(path, what) for path, what in checked if what]
+
+
+def _unreadable(path: pathlib.Path) -> str:
+    """Return why a shard cannot be read to its end; an empty text if it can."""
+    if not path.is_file():
+        return "missing"
+    try:
+        shards.read_shard(path, kind=shards.read_meta(path)["kind"])
+    except shards.DamagedShard as error:
+        return error.what
+    return ""
 
 
 def repair(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -145,7 +65,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     if not (folder / "config.json").is_file() and not (folder / MANIFEST).is_file():
         raise UserError(f"data set {folder}: no such data set; give a folder that dipn-datagen wrote")
     try:
-        known = _read_manifest(folder)["shards"]
+        known = manifest.listed(folder)
     except UserError:
         known = {}
     removed = []
@@ -154,19 +74,15 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
             files.move(path, path.with_suffix(".parquet.damaged"))
             removed.append(path)
     (folder / MANIFEST).unlink(missing_ok=True)
-    update_manifest(folder)
+    manifest.update_manifest(folder)
     return removed
 
 
 def _good(path: pathlib.Path, entry: dict[str, Any] | None) -> bool:
     """Return whether a shard can be read to its end, and is the one that the manifest lists, if it lists one."""
-    try:
-        if not path.is_file() or (entry is not None and files.file_sha256(path) != entry["sha256"]):
-            return False
-        shards.read_shard(path, kind=shards.read_meta(path)["kind"])
-    except shards.DamagedShard:
+    if entry is not None and (not path.is_file() or files.file_sha256(path) != entry["sha256"]):
         return False
-    return True
+    return not _unreadable(path)
 
 
 def summary(folder: pathlib.Path) -> dict[str, Any]:
@@ -176,22 +92,21 @@ def summary(folder: pathlib.Path) -> dict[str, Any]:
     both are None where nothing is known. `made_by` lists every combination of versions and kind of processor,
     `merged` what was joined to a merged data set.
     """
-    manifest = _read_manifest(folder)
-    entries = manifest["shards"]
-    metas = [shards.read_meta(folder / name) for name in entries]
+    found = manifest.entries(folder)
+    metas = [shards.read_meta(folder / name) for name in found]
     faults: dict[str, int] = {}
-    for entry in entries.values():
+    for entry in found.values():
         for name, count in entry["faults"].items():
             faults[name] = faults.get(name, 0) + count
-    held = accounting.held(entries)
+    held = accounting.held(found)
     asked = accounting.asked(folder)
     return {
-        "kind": manifest["kind"],
+        "kind": next((entry["kind"] for entry in found.values()), None),
         "episodes": sum(held.values()),
         "asked": asked and asked.episodes,
         "missing": accounting.missing(folder, held),
-        "shards": len(entries),
-        "bytes": sum(entry["bytes"] for entry in entries.values()),
+        "shards": len(found),
+        "bytes": sum(entry["bytes"] for entry in found.values()),
         "faults": faults,
         "config": metas[0]["config"] if metas else None,
         "versions": metas[0]["versions"] if metas else None,
@@ -206,7 +121,9 @@ def missing(folder: pathlib.Path) -> str | None:
     Raises:
       UserError: there is no data set, or what was asked for cannot be read.
     """
-    return accounting.missing(folder, accounting.held(_read_manifest(folder)["shards"]))
+    listed = manifest.listed(folder)
+    others = {path.name: {"episodes": shards.count(path)} for path in manifest.unlisted(folder, listed)}
+    return accounting.missing(folder, accounting.held(listed | others))
 
 
 def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | SettledScene:
@@ -244,22 +161,22 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
     Raises:
       UserError: no such data set, a shard is missing or damaged, or it holds another kind.
     """
-    manifest = checked(folder, kind=kind)
-    parts = [shards.read_shard(folder / name, kind=kind) for name in manifest["shards"]]
+    found = checked(folder, kind=kind)
+    parts = [shards.read_shard(folder / name, kind=kind) for name in found]
     widths = {part.scene.shape.shape[1] for part in parts}
     if len(widths) > 1:
         raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
     episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return episodes, fingerprint(manifest)
+    return episodes, fingerprint(found)
 
 
-def fingerprint(manifest: dict[str, Any]) -> str:
-    """Return a fingerprint of the data set that has this manifest: it follows from the content of the shards."""
-    return hashlib.sha256(json.dumps([entry["sha256"] for entry in manifest["shards"].values()]).encode()).hexdigest()
+def fingerprint(entries: dict[str, Any]) -> str:
+    """Return a fingerprint of the data set that has these shards: it follows from their content."""
+    return hashlib.sha256(json.dumps([entry["sha256"] for entry in entries.values()]).encode()).hexdigest()
 
 
 def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
-    """Return the manifest of a data set after checking every shard; it lists one at least.
+    """Return the entry of every shard of a data set, which has one at least, after checking each.
 
     Where episodes that were asked for have not been made, one line says so.
 
@@ -270,31 +187,25 @@ def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
     Raises:
       UserError: no such data set, or a shard is missing or damaged.
     """
-    manifest = whole(folder, kind=kind)
+    found = whole(folder, kind=kind)
     try:
-        said = accounting.missing(folder, accounting.held(manifest["shards"]))
+        said = accounting.missing(folder, accounting.held(found))
     except UserError as error:  # what was asked for cannot be read; the shards are whole all the same
         said = str(error)
     if said:
         console.warn(said)
-    return manifest
+    return found
 
 
 def whole(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
-    """Return the manifest as `checked` does, whatever is missing of what was asked for."""
-    manifest = _read_manifest(folder)
+    """Return the entries of a data set as `checked` does, whatever is missing of what was asked for."""
     if problems := verify(folder):
-        number = f"{len(problems)} of {max(len(manifest['shards']), len(problems))} shards"
+        path, what = problems[0]
         raise UserError(
-            f"data set {folder}: {problems[0][0].name} {problems[0][1]} ({number}); {advice(folder, problems)}"
+            f"data set {folder}: {path.name} {what} ({len(problems)} shards wrong in all); "
+            f"run dipn-datagen repair {folder}, then generate again"
         )
-    if not manifest["shards"]:
+    found = manifest.entries(folder)
+    if not found:
         raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
-    return manifest
-
-
-def advice(folder: pathlib.Path, problems: list[tuple[pathlib.Path, str]]) -> str:
-    """Return what is to be done about what `verify` has found."""
-    if all(what == UNLISTED for _, what in problems):
-        return f"if you copied them there, run dipn-datagen merge {folder}"
-    return f"run dipn-datagen repair {folder}, then generate again"
+    return found

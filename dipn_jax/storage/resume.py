@@ -18,22 +18,31 @@ FORMAT_VERSION = 1
 class Partial:
     """The state of unfinished work, in `OUT/partial.npz`; one of other settings, inputs or sources is not taken up.
 
-    `networks` holds step and digest of each run among the inputs, `files` the SHA-256 of each file, by their names;
-    `code` is the digest of our sources and of the versions of packages.
+    `named` holds the settings that are no paths, `content` a digest of each input; `networks` step and digest of each
+    run among the inputs, `files` the SHA-256 of each file, by their names; `code` is the digest of our sources and of
+    the versions of packages.
     """
 
-    def __init__(self, out: pathlib.Path, settings: dict[str, Any], *, inputs: Sequence[pathlib.Path] = ()) -> None:
+    def __init__(
+        self,
+        out: pathlib.Path,
+        settings: dict[str, Any],
+        *,
+        inputs: Sequence[pathlib.Path] = (),
+        part: tuple[int, int] | None = None,
+    ) -> None:
         """Prepare to load and save the state of work with these settings.
 
         Args:
           out: folder of the results.
           settings: options that the results depend on; those that are paths are recorded by `inputs`.
           inputs: files and runs that the results depend on, by content, not by name.
+          part: number of this part of the work and how many there are, where others do the rest.
         """
         self.path = out / "partial.npz"
-        content = [_fingerprint(path) for path in inputs]
-        named = {key: str(value) for key, value in settings.items() if not _has_path(value)}
-        self.identity = json.dumps([FORMAT_VERSION, named, content])
+        self.content = [_fingerprint(path) for path in inputs]
+        self.named = {key: str(value) for key, value in settings.items() if not _has_path(value)}
+        self.identity = json.dumps([FORMAT_VERSION, self.named, self.content, *([part] if part else [])])
         self.networks = {str(path): checkpoint.used(path) for path in inputs if not path.is_file()}
         self.files = {str(path): files.file_sha256(path) for path in inputs if path.is_file()}
         self.code = files.code_digest(*_stages())

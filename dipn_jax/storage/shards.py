@@ -10,6 +10,7 @@ ends with episodes or with a `UserError`.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import pathlib
 from collections.abc import Iterable, Iterator
@@ -59,8 +60,8 @@ def shard_files(folder: pathlib.Path) -> list[pathlib.Path]:
 
 def write_shard(
     folder: pathlib.Path, index: int, episodes: Any, *, kind: str, config: Any, faults: dict[str, Any]
-) -> None:
-    """Write one shard.
+) -> dict[str, Any]:
+    """Write one shard, and return its entry in the manifest.
 
     Args:
       folder: the data set.
@@ -100,7 +101,23 @@ def write_shard(
         column_encoding={f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in coded},
         write_page_checksum=True,
     )
-    files.write_atomically(shard_path(folder, index), sink.getvalue().to_pybytes())
+    data = sink.getvalue().to_pybytes()
+    files.write_atomically(shard_path(folder, index), data)
+    return _entry(len(arrays[0]), len(data), hashlib.sha256(data).hexdigest(), kind, faults)
+
+
+def entry(path: pathlib.Path) -> dict[str, Any]:
+    """Return the entry of a shard in the manifest of its data set.
+
+    Raises:
+      UserError: see `read_meta`.
+    """
+    meta = read_meta(path)
+    return _entry(meta["episodes"], path.stat().st_size, files.file_sha256(path), meta["kind"], meta["faults"])
+
+
+def _entry(episodes: int, size: int, sha256: str, kind: str, faults: dict[str, Any]) -> dict[str, Any]:
+    return {"episodes": episodes, "bytes": size, "sha256": sha256, "kind": kind, "faults": faults}
 
 
 @contextlib.contextmanager

@@ -7,8 +7,12 @@ from typing import Annotated
 
 import tyro
 
+from dipn_jax import command_words
+from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName, MethodName
 
+from .. import shares
+from ..shares import WHOLE, Share
 from . import evaluation
 from .camera import DEFAULT_CAMERA, Camera
 from .tables import DEFAULT_TABLES, Tables
@@ -32,6 +36,8 @@ def clear(
     seed: int = 1_000_000,
     engine: EngineName = "auto",
     threads: int | None = None,
+    share: Annotated[Share, tyro.conf.arg(name="")] = WHOLE,
+    launch: Annotated[Launch, tyro.conf.arg(name="")] = LOCAL,
 ) -> None:
     """Clear tables: push or grasp, until nothing is left.
 
@@ -46,6 +52,9 @@ def clear(
 
     Without any aid, with scores as the network gives them and the rule as published:
       dipn-eval clear --push-net builtin --grasp-net builtin --aids --label bare --out results/bare
+
+    A quarter of the tables, as one of four workers; dipn-eval merge makes one evaluation of their parts:
+      dipn-eval clear --push-net builtin --grasp-net builtin --instances 30 --shard 0 --of 4 --out results/part-0
 
     Args:
       out: folder for metrics.json and every step of every table.
@@ -69,19 +78,41 @@ def clear(
       seed: random seed of scenes, perturbations, noise and candidates.
       engine: physics engine.
       threads: that native simulates on; one a core if not given.
+      share: which part of the tables this worker clears.
+      launch: where tables are cleared; as tasks, all shards are made and put together.
     """
-    given = evaluation.settings(locals())
-    from dipn_jax.physics import make_engine
+    asked = dict(locals())
+    given = evaluation.settings(asked)
+    from dipn_jax.physics import grouped, make_engine
     from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.storage import resume
 
+    from .. import spread
     from . import on_tables
 
     config = PolicyConfig(
         candidates=candidates, distances=distances, gamma=gamma, grasp_above=threshold, released=released, aids=aids
     )
     evaluation.check(out, seed, config, tables)
-    networks, physics = Networks(push_net, grasp_net, value_net), make_engine(engine, threads=threads)
+    share.check(launch)
+    networks, physics = Networks(push_net, grasp_net, value_net), grouped.apart(make_engine(engine, threads=threads))
+    if launch.spreads:
+        spread.spread(
+            "clear", asked, resume.Partial(out, given, inputs=evaluation.inputs(networks.runs(method), tables))
+        )
+        return
     (decide,) = on_tables.load(method, networks, physics, [config], camera=camera)
     longest, runs = max(*distances, evaluation.SIMULATED_PUSH), networks.runs(method)
     remember = "memory" in aids
-    evaluation.clear(out, decide, physics, tables, given=given, runs=runs, longest=longest, remember=remember)
+    evaluation.clear(
+        out,
+        decide,
+        physics,
+        tables,
+        given=given,
+        runs=runs,
+        longest=longest,
+        remember=remember,
+        share=share,
+        command=command_words.words(clear, asked, without=shares.OWN),
+    )

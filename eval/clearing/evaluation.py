@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from dipn_jax import console
 from dipn_jax.errors import UserError
 
-from .. import options
+from .. import options, shares
+from ..shares import WHOLE, Share
 from .camera import Camera
 from .tables import SHIPPED, Tables
 
@@ -72,8 +74,10 @@ def clear(
     runs: dict[str, pathlib.Path],
     longest: float,
     remember: bool,
+    share: Share = WHOLE,
+    command: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Clear tables and write the results; continues where it was interrupted.
+    """Clear tables and write the results, or the part of this worker; continues where it was interrupted.
 
     Args:
       out: folder of the results.
@@ -84,9 +88,11 @@ def clear(
       runs: networks that `decide` uses.
       longest: metres of the longest push.
       remember: whether the scores of grasps like one that missed are halved as long as the table looks the same.
+      share: which tables this worker clears; every worker drops all of them, which takes little time.
+      command: that makes the evaluation, without `--out`, `--shard` and `--of`.
 
     Returns:
-      The metrics.
+      The metrics; none of a part.
 
     Raises:
       UserError: another process has the folder.
@@ -96,11 +102,28 @@ def clear(
     from . import lockstep
 
     seed = given["seed"]
-    partial: resume.Partial = resume.Partial(out, given, inputs=inputs(runs, tables))
+    partial: resume.Partial = resume.Partial(out, given, inputs=inputs(runs, tables), part=share.named())
     with owner.owned(out):
+        if shares.made(out, "clear", share, partial):
+            return {}
         instances = tables.make(physics, seed=seed)
-        ended = lockstep.clear(instances, physics, decide, partial, seed=seed, longest=longest, remember=remember)
-        lockstep.save(ended, out)
+        rows = share.rows(len(instances))
+        mine = [instances[row] for row in rows]
+        ended = lockstep.clear(mine, physics, decide, partial, seed=seed, longest=longest, remember=remember)
+        names = lockstep.save(ended, out, numbers=rows)
+        if not share.whole:
+            shares.write(
+                out,
+                "clear",
+                share,
+                total=len(instances),
+                command=command,
+                given=given,
+                partial=partial,
+                names=names,
+                about={},
+            )
+            return {}
         values = lockstep.summary(ended)
         options.finish(out, values, given, partial)
     return values

@@ -25,6 +25,8 @@ from . import film
 from .instances import Instance
 from .on_tables import TablePolicy
 
+EPISODES = "episodes.json"
+"""Name of the file that lists the tables of an evaluation."""
 ACTIONS_PER_OBJECT = 3
 """Most actions per object; a table that needs more is not cleared. Source: the paper."""
 
@@ -175,7 +177,7 @@ def counts(tables: Sequence[Outcome] | Sequence[Instance]) -> dict[str, tuple[np
     }
 
 
-def summary(instances: list[Instance]) -> dict[str, Any]:
+def summary(instances: Sequence[Outcome] | Sequence[Instance]) -> dict[str, Any]:
     """Return flat metrics, each with a bootstrap 95 % interval over cases, then their repeats (`_low`, `_high`).
 
     As in the paper: completion is instances cleared over instances, grasp success is objects grasped over grasp
@@ -195,18 +197,25 @@ def summary(instances: list[Instance]) -> dict[str, Any]:
     return result
 
 
-def save(instances: list[Instance], out: pathlib.Path) -> None:
-    """Write every step of every instance to `episodes/NUMBER.npz` (see `eval.film`), and `episodes.json`, their
-    list.
+def save(instances: list[Instance], out: pathlib.Path, *, numbers: Sequence[int] | None = None) -> list[str]:
+    """Write every step of every instance to `episodes/NUMBER.npz` (see `eval.film`), and `episodes.json`, their list.
+
+    Args:
+      instances: tables that have ended.
+      out: folder of the results.
+      numbers: of these tables among all that are cleared; 0, 1, ... if not given.
+
+    Returns:
+      The names of the files.
     """
-    lines = []
-    for number, instance in enumerate(instances):
-        stem = f"{number:03d}"
-        film.save(out / "episodes" / f"{stem}.npz", instance)
+    lines: list[dict[str, Any]] = []
+    for number, instance in zip(numbers or range(len(instances)), instances, strict=True):
+        name = f"episodes/{number:03d}.npz"
+        film.save(out / name, instance)
         lines.append(
             {
                 "name": instance.name,
-                "file": f"episodes/{stem}.npz",
+                "file": name,
                 "ended": instance.ended,
                 "objects": instance.objects,
                 "removed": instance.removed,
@@ -215,4 +224,5 @@ def save(instances: list[Instance], out: pathlib.Path) -> None:
                 "pushes": instance.pushes,
             }
         )
-    files.write_json(out / "episodes.json", lines)
+    files.write_json(out / EPISODES, lines)
+    return [EPISODES, *(line["file"] for line in lines)]

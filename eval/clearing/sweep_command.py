@@ -60,7 +60,7 @@ def sweep(
       threads: that native simulates on; one a core if not given.
     """
     given = evaluation.settings(locals()) | {"method": "dipn+gn", "label": ""}
-    from dipn_jax.physics import make_engine
+    from dipn_jax.physics import grouped, make_engine
     from dipn_jax.planning.methods import Networks, PolicyConfig
     from dipn_jax.storage import owner, resume
 
@@ -73,7 +73,7 @@ def sweep(
     evaluation.check(out, seed, chosen, tables)
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
     configs[sweeping.CHOSEN] = chosen
-    networks, physics = Networks(push_net, grasp_net), make_engine(engine, threads=threads)
+    networks, physics = Networks(push_net, grasp_net), grouped.apart(make_engine(engine, threads=threads))
     kept = resume.Partial(out, given, inputs=evaluation.inputs(networks.runs("dipn+gn"), tables))
     with owner.owned(out):
         values = _clear_with_each(out, configs, networks, physics, tables, camera, given=given, kept=kept)

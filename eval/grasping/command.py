@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from dipn_jax import console
+from dipn_jax import command_words, console
 from dipn_jax.errors import UserError
+from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
-from .. import options
+from .. import options, shares
 from ..clearing.camera import DEFAULT_CAMERA, Camera
+from ..shares import WHOLE, Share
 
 
 def grasp(
@@ -30,6 +32,8 @@ def grasp(
     engine: EngineName = "auto",
     threads: int | None = None,
     ranges: Ranges = DEFAULT_RANGES,
+    share: Annotated[Share, tyro.conf.arg(name="")] = WHOLE,
+    launch: Annotated[Launch, tyro.conf.arg(name="")] = LOCAL,
 ) -> None:
     """Measure how often the best-scored grasp holds until the tables are empty, and how often a random one does.
 
@@ -53,31 +57,42 @@ def grasp(
       engine: physics engine.
       threads: that native simulates on; one a core if not given.
       ranges: the ranges that random objects are drawn from.
+      share: which part of the tables this worker tries, for dipn-eval merge.
+      launch: where grasps are tried; as tasks, all shards are made and put together.
     """
-    settings = options.settings(locals())
+    asked = dict(locals())
+    settings = options.settings(asked)
     settings |= {f"camera.{name}": value for name, value in dataclasses.asdict(settings.pop("camera")).items()}
     options.check(out, seed, scenes=scenes_)
     console.require_between(0, 1024, others=others)
     if not grasp_net and not curve:
         raise UserError("grasp: nothing to measure; give --grasp-net or --curve")
-    from dipn_jax.physics import make_engine
+    share.check(launch)
+    if not grasp_net and share.of > 1:
+        raise UserError("--of: without --grasp-net there are no tables to share")
+    from dipn_jax.physics import grouped, make_engine
     from dipn_jax.planning import scorers
     from dipn_jax.storage import checkpoint, owner, resume
     from dipn_jax.world import scenes
 
-    from .. import curves
+    from .. import curves, spread
     from ..clearing import lockstep
-    from . import success
+    from . import merging, success
 
     config, single = (scenes.parse_objects(count, ranges=ranges) for count in (objects, "1"))
     run = checkpoint.find(grasp_net, network="grasp") if grasp_net else None
-    partial = resume.Partial(out, settings, inputs=[run] if run else [])
-    values: dict[str, Any] = curves.grasp_summary(curves.load_grasp_runs(curve))
+    partial = resume.Partial(out, settings, inputs=[run] if run else [], part=share.named())
+    online = curves.grasp_summary(curves.load_grasp_runs(curve)) if curve else None
     if run:
-        physics, scorer = make_engine(engine, threads=threads), scorers.load_scorer(run, aids=aids)
+        physics, scorer = grouped.apart(make_engine(engine, threads=threads)), scorers.load_scorer(run, aids=aids)
+    if launch.spreads:
+        spread.spread("grasp", asked, partial)
+        return
     with owner.owned(out):
+        if shares.made(out, "grasp", share, partial):
+            return
         if run:
-            found, tables = success.evaluate(
+            found, tables = success.tried(
                 scorer,
                 physics,
                 config,
@@ -87,11 +102,26 @@ def grasp(
                 others=others,
                 camera=camera,
                 aids=aids,
+                share=share,
             )
-            alone = success.label_agreement(physics, single, scenes=scenes_, seed=seed)
-            values |= found | {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
-            lockstep.save(tables, out)
-            success.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
-        if curve:
+            found |= success.labels_tried(physics, single, scenes=scenes_, seed=seed, share=share)
+            names = lockstep.save(tables, out, numbers=share.rows(scenes_))
+            if not share.whole:
+                merging.save(out, found)
+                shares.write(
+                    out,
+                    "grasp",
+                    share,
+                    total=scenes_,
+                    command=command_words.words(grasp, asked, without=shares.OWN),
+                    given=settings,
+                    partial=partial,
+                    names=[*names, merging.TRIED],
+                    about={"others": others, "online": online},
+                )
+                return
+            values = merging.finish(out, found, tables, others=others, online=online)
+        else:
+            values = online or {}
             curves.grasp_figure(values).savefig(out / "curve.png", dpi=130)
         options.finish(out, values, settings, partial)

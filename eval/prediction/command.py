@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import pathlib
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
+from dipn_jax import command_words
 from dipn_jax.errors import UserError
+from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
-from .. import options
-
-if TYPE_CHECKING:
-    import numpy as np
+from .. import options, shares
+from ..shares import WHOLE, Share
 
 
 def predict(
@@ -29,6 +29,8 @@ def predict(
     physics: bool = True,
     segmented: bool = True,
     ranges: Ranges = DEFAULT_RANGES,
+    share: Annotated[Share, tyro.conf.arg(name="")] = WHOLE,
+    launch: Annotated[Launch, tyro.conf.arg(name="")] = LOCAL,
 ) -> None:
     """Measure the error of the predicted masks after 5 and 10 cm of a push, on scenes never trained on.
 
@@ -51,30 +53,58 @@ def predict(
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
       segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
       ranges: the ranges that random objects are drawn from.
+      share: which part of the pushes this worker makes, for dipn-eval merge; they are shared in groups of 64.
+      launch: where pushes are made; as tasks, all shards are made and put together.
     """
-    settings = options.settings(locals())
+    asked = dict(locals())
+    settings = options.settings(asked)
     options.check(out, seed, scenes=scenes_)
+    share.check(launch)
     if not push_net and not curve:
         raise UserError("prediction: nothing to measure; give --push-net or --curve")
     from dipn_jax.physics import make_engine
     from dipn_jax.storage import owner, resume
     from dipn_jax.world import scenes
 
-    from .. import curves
-    from . import push_errors
+    from .. import spread
+    from . import merging, push_errors
 
     config = scenes.parse_objects(objects, ranges=ranges)
     networks, compared, runs = _load(push_net, curve)
-    partial = resume.Partial(out, settings, inputs=runs)
+    partial = resume.Partial(out, settings, inputs=runs, part=share.named())
     truth = make_engine(engine, threads=threads)
+    if launch.spreads:
+        spread.spread("prediction", asked, partial)
+        return
     with owner.owned(out):
-        values, films = push_errors.evaluate(
-            networks, truth, config, partial, scenes=scenes_, seed=seed, physics=physics, segmented=segmented
+        if shares.made(out, "prediction", share, partial):
+            return
+        rows, films = push_errors.measured(
+            networks,
+            truth,
+            config,
+            partial,
+            scenes=scenes_,
+            seed=seed,
+            physics=physics,
+            segmented=segmented,
+            share=share,
         )
-        kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in compared)}
-        values = kept | curves.push_summary(values, compared)
-        _save_pictures(out, films, values, curve=bool(curve))
-        options.finish(out, values, settings, partial)
+        if share.whole:
+            merging.save_films(out, films)
+            options.finish(out, merging.finish(out, rows, compared), settings, partial)
+            return
+        shares.write(
+            out,
+            "prediction",
+            share,
+            total=push_errors.groups(scenes_),
+            command=command_words.words(predict, asked, without=shares.OWN),
+            given=settings,
+            partial=partial,
+            names=merging.save(out, rows, films),
+            about={"arrays": list(rows), "compared": compared},
+        )
 
 
 def _load(
@@ -94,17 +124,3 @@ def _load(
     compared = curves.load_push_runs(runs)
     networks = {"dipn": checkpoint.load_network(single[0], network="dipn")} if single else {}
     return networks | compared, list(compared), [*single, *runs]
-
-
-def _save_pictures(out: pathlib.Path, films: dict[str, np.ndarray], values: dict[str, float], *, curve: bool) -> None:
-    """Write `films.npz`, and the figures and tables of a learning curve where there is one."""
-    import numpy as np
-
-    from dipn_jax import files
-
-    from .. import curves
-
-    np.savez_compressed(out / "films.npz", allow_pickle=False, **films)
-    for which in ("all", "moved") if curve else ():
-        curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
-        files.write_text(out / f"curve-{which}.md", curves.push_table(values, which=which))

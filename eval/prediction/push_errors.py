@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -22,8 +22,11 @@ from dipn_jax.storage import resume
 from dipn_jax.structs import Observation, Push
 from dipn_jax.world.scenes import SceneConfig
 
+from ..shares import WHOLE, Share
 from .pushes import DISTANCES, Executed, execute
 
+GROUP = batching.BATCH
+"""Pushes that are drawn together: a function of the seed and of their group's number, so that any worker makes them."""
 MAX_ATTEMPTS = 100
 """Batches in a row without a usable push after which an evaluation gives up."""
 FILMS = 6
@@ -52,7 +55,7 @@ def evaluate(
     """Measure the errors of every predictor on held-out scenes, one push each.
 
     Args:
-      networks: what to measure by the name it gets in the metrics; the first also makes the pictures.
+      networks: as of `measured`, like the others.
       engine: the engine whose result counts as the truth.
       config: scenes.
       partial: where an interrupted evaluation is kept.
@@ -64,31 +67,88 @@ def evaluate(
     Returns:
       Flat metrics, and pictures `[F, ...]` of some pushes (before, predicted, after 10 cm).
     """
+    rows, films = measured(
+        networks, engine, config, partial, scenes=scenes, seed=seed, physics=physics, segmented=segmented
+    )
+    return summary(rows), films
+
+
+def measured(
+    networks: Mapping[str, DIPN],
+    engine: Engine,
+    config: SceneConfig,
+    partial: resume.Partial,
+    *,
+    scenes: int,
+    seed: int,
+    physics: bool,
+    segmented: bool,
+    share: Share = WHOLE,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Measure the errors of every predictor on the groups of held-out scenes that are this worker's.
+
+    Args:
+      networks: what to measure by the name it gets in the metrics; the first also makes the pictures.
+      engine: the engine whose result counts as the truth.
+      config: scenes.
+      partial: where an interrupted evaluation is kept.
+      scenes: number of scenes of the whole evaluation.
+      seed: random seed of the scenes and pushes.
+      physics: also roll the engine out with nominal mass and friction.
+      segmented: also measure with masks found in the image.
+      share: which groups.
+
+    Returns:
+      Errors `[B, K, N]` of each push, as Rows, and under `group` the number of its group `[B]`; and pictures `[F, ...]`
+      of the first pushes of the first group (before, predicted, after 10 cm), where that is among them.
+    """
     predictors = _with_baselines(networks)
     rows: Rows = {}
     films: list[dict[str, np.ndarray]] = []
-    key = seeds.key(seed, seeds.Purpose.PREDICTION_SCENES)
-    done, batch, rows, films = partial.load((0, 0, rows, films))
-    with console.Progress("prediction", scenes, unit="pushes", done=done) as progress:
-        empty = 0
-        while done < scenes:
-            count = min(batching.BATCH, scenes - done)
-            executed = execute(jax.random.fold_in(key, batch), engine, config, count, physics=physics)
-            if len(executed):
+    mine = share.rows(groups(scenes))
+    total = sum(min(GROUP, scenes - number * GROUP) for number in mine)
+    begun, rows, films = partial.load((0, rows, films))
+    done = sum(min(GROUP, scenes - number * GROUP) for number in mine[:begun])
+    with console.Progress("prediction", total, unit="pushes", done=done) as progress:
+        for at, number in list(enumerate(mine))[begun:]:
+            for executed in _group(seed, number, engine, config, min(GROUP, scenes - number * GROUP), physics=physics):
                 seen = executed.seen()
                 motions = measure(rows, executed, predictors, seen)
+                rows.setdefault("group", []).append(np.full(len(executed), number))
                 if segmented:
                     found = seen.replace(label=_found(seen, config.slots))
                     measure(rows, executed, predictors, found, suffix=SEGMENTED)
-                films += [executed.film(seen, motions, i) for i in range(min(FILMS - len(films), len(executed)))]
-            empty = 0 if len(executed) else empty + 1
-            if empty == MAX_ATTEMPTS:
-                raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; give fewer --objects")
-            progress.advance(len(executed))
-            done, batch = done + len(executed), batch + 1
-            partial.save((done, batch, rows, films))
-    names = [*predictors, *(["physics"] if physics else [])]
-    return _summary(rows, names, segmented), {k: np.stack([film[k] for film in films]) for k in films[0]}
+                count = min(FILMS - len(films), len(executed)) if number == 0 else 0
+                films += [executed.film(seen, motions, i) for i in range(count)]
+                progress.advance(len(executed))
+            partial.save((at + 1, rows, films))
+    joined = {key: np.concatenate(values) for key, values in rows.items()}
+    return joined, {key: np.stack([film[key] for film in films]) for key in (films[0] if films else ())}
+
+
+def groups(scenes: int) -> int:
+    """Return the number of groups of so many scenes."""
+    return -(-scenes // GROUP)
+
+
+def _group(
+    seed: int, number: int, engine: Engine, config: SceneConfig, count: int, *, physics: bool
+) -> Iterator[Executed]:
+    """Execute `count` pushes, which do not depend on those of other groups, in one batch or more.
+
+    Raises:
+      UserError: no push is feasible.
+    """
+    key = jax.random.fold_in(seeds.key(seed, seeds.Purpose.PREDICTION_SCENES), number)
+    batch = empty = 0
+    while count:
+        # the first batch has the group's own key, and others are drawn for what was not feasible in it
+        executed = execute(jax.random.fold_in(key, batch) if batch else key, engine, config, count, physics=physics)
+        batch, empty, count = batch + 1, 0 if len(executed) else empty + 1, count - len(executed)
+        if empty == MAX_ATTEMPTS:
+            raise UserError(f"prediction: {MAX_ATTEMPTS} batches without a feasible push; give fewer --objects")
+        if len(executed):
+            yield executed
 
 
 def _with_baselines(networks: Mapping[str, DIPN]) -> dict[str, Predict]:
@@ -194,9 +254,12 @@ def _errors(
     }
 
 
-def _summary(rows: Rows, names: list[str], segmented: bool) -> dict[str, float]:
+def summary(joined: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return flat metrics of errors `[B, K, N]`, as `measured` returns them."""
     metrics: dict[str, float] = {}
-    joined = {key: np.concatenate(values) for key, values in rows.items()}
+    measures = [key.rpartition("/")[0] for key in joined if key.endswith("/push_error")]
+    names = [name for name in measures if not name.endswith(SEGMENTED)]
+    segmented = len(measures) > len(names)
 
     def mean(key: str, k: int, counted: np.ndarray) -> float:
         return float(joined[key][:, k][counted].mean()) if counted.any() else float("nan")

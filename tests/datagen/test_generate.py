@@ -13,7 +13,7 @@ from dipn_jax.datagen.generate import Job, generate
 from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import native
-from dipn_jax.storage import records, shards
+from dipn_jax.storage import manifest, records, shards
 from dipn_jax.world import scenes
 
 JOB = Job(
@@ -106,6 +106,36 @@ def test_an_interruption_loses_at_most_the_unfinished_shards(
     assert records.verify(out) == [] and len(records.load(out, kind="push")[0].fault) == 33
     for index in (0,):  # the second is longer here
         assert shards.shard_path(out, index).read_bytes() == shards.shard_path(copy, index).read_bytes()
+
+
+def test_the_manifest_is_written_once_however_many_shards_there_are(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[int] = []
+    write = manifest._write
+    monkeypatch.setattr(manifest, "_write", lambda at, entries: written.append(len(entries)) or write(at, entries))
+    job = dataclasses.replace(JOB, kind="images", episodes=4, shard_size=1, actions=1)
+    generate(job, tmp_path)
+    assert written == [4]
+
+
+def test_a_data_set_whose_extension_is_killed_stays_whole(copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last shard is made longer; killed before or after that, the manifest does not contradict it."""
+    write, update = shards.write_shard, manifest.update_manifest
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(manifest, "update_manifest", stopped)  # killed: no time is left for it
+    monkeypatch.setattr(shards, "write_shard", stopped)
+    for writing, episodes in ((stopped, 24), (write, 28)):
+        monkeypatch.setattr(shards, "write_shard", writing)
+        with pytest.raises(KeyboardInterrupt):
+            generate(dataclasses.replace(JOB, episodes=28), copy)
+        assert records.verify(copy) == [] and len(records.load(copy, kind="push")[0].fault) == episodes
+    monkeypatch.setattr(manifest, "update_manifest", update)
+    generate(dataclasses.replace(JOB, episodes=28), copy)
+    assert records.verify(copy) == [] and records.missing(copy) is None
 
 
 def test_another_config_in_the_same_folder_is_refused(copy: pathlib.Path) -> None:

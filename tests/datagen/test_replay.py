@@ -12,6 +12,7 @@ from dipn_jax.datagen import cli, replay
 
 from dipn_jax import console, machine, structs
 from dipn_jax.storage import codec, records, shards
+from dipn_jax.storage.manifest import MANIFEST, update_manifest
 
 
 @pytest.fixture
@@ -31,8 +32,8 @@ def rewritten(folder: pathlib.Path, out: pathlib.Path, change: Any) -> pathlib.P
     meta = shards.read_meta(path)
     episodes = change(shards.read_shard(path, kind=meta["kind"]))
     shards.write_shard(copy, 0, episodes, kind=meta["kind"], config=meta["config"], faults=meta["faults"])
-    (copy / records.MANIFEST).unlink()
-    records.update_manifest(copy)
+    (copy / MANIFEST).unlink()
+    update_manifest(copy)
     return copy
 
 
@@ -51,8 +52,8 @@ def test_sets_that_were_simulated_differently_are_not_replayed_as_one(
     path = shards.shard_path(copy, 1)
     config = shards.read_meta(path)["config"] | {"timestep": 0.001}
     shards.write_shard(copy, 1, shards.read_shard(path, kind="push"), kind="push", config=config, faults={})
-    (copy / records.MANIFEST).unlink()
-    records.update_manifest(copy)
+    (copy / MANIFEST).unlink()
+    update_manifest(copy)
     code, _, error = call(copy, "--all")
     assert code == 2 and error.count("\n") == 1
     assert "simulated differently (native at 0.001 s, native at its own step)" in error

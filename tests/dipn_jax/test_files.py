@@ -12,6 +12,7 @@ import pytest
 
 from dipn_jax import files
 from dipn_jax.storage import records
+from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.world import cases
 
 SCRIPT = """
@@ -61,7 +62,7 @@ def test_a_byte_order_mark_is_read_over(tmp_path: pathlib.Path, data: dict[str, 
     _marked(mine)
     assert cases.load_cases(mine)[0] == cases.load_cases()[0]
     assert list(files.read_json(mine))
-    manifest = data["images"] / records.MANIFEST
+    manifest = data["images"] / MANIFEST
     before = manifest.read_bytes()
     _marked(manifest)
     try:

@@ -29,6 +29,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
 
 
 @pytest.fixture(scope="session")
+def tiny(runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, pathlib.Path]:
+    """Return runs of networks with random weights, of which GN is as small as can be."""
+    folder, config = tmp_path_factory.mktemp("tiny"), GraspConfig(width=8, coarse=8, blocks=1)
+    model = checkpoint.build("grasp", config)
+    checkpoint.save(folder / "grasp", 1, {"model": nnx.state(model)}, network="grasp", config=config, extra={})
+    return runs | {"grasp": folder / "grasp"}
+
+
+@pytest.fixture(scope="session")
 def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return two hard cases on which networks with random weights acted: one by grasps, one by pushes."""
     out = tmp_path_factory.mktemp("clear")

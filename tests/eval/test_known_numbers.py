@@ -11,9 +11,9 @@ from dipn_jax.eval.prediction import push_errors
 
 def test_every_measure_of_a_network_has_a_curve() -> None:
     keys = ("push_error", "push_error_paper_measure", "push_position_mm", "push_angle_deg")
-    rows = {f"10/0{end}/{key}": [np.ones((1, 2, 1))] for end in ("", push_errors.SEGMENTED) for key in keys}
-    rows |= {key: [np.ones((1, 2, 1), bool)] for key in ("visible", "moved")}
-    measured = {key.split("/")[0] for key in push_errors._summary(rows, ["10/0"], segmented=True) if "/10/0/" in key}
+    rows = {f"10/0{end}/{key}": np.ones((1, 2, 1)) for end in ("", push_errors.SEGMENTED) for key in keys}
+    rows |= {key: np.ones((1, 2, 1), bool) for key in ("visible", "moved")}
+    measured = {key.split("/")[0] for key in push_errors.summary(rows) if "/10/0/" in key}
     assert set(curves.PUSH_MEASURES) == measured and len(measured) == 6
 
 

@@ -13,7 +13,7 @@ from dipn_jax import console, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.storage import records, shards
+from dipn_jax.storage import manifest, records, shards
 
 Data = dict[str, pathlib.Path]
 
@@ -27,7 +27,7 @@ def wider(data: Data, tmp_path: pathlib.Path) -> Data:
         made[kind].mkdir()
         episodes = widened(records.load(data[kind], kind=kind)[0], 5)
         shards.write_shard(made[kind], 0, episodes, kind=kind, config={}, faults={})
-        records.update_manifest(made[kind])
+        manifest.update_manifest(made[kind])
     return made
 
 

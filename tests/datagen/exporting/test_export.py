@@ -14,7 +14,7 @@ from dipn_jax.train.split import split
 
 from dipn_jax import console, files
 from dipn_jax.sight import render
-from dipn_jax.storage import records, shards
+from dipn_jax.storage import manifest, records, shards
 
 FORMATS = ("parquet", "npz", "hdf5", "zarr", "lerobot")
 Data = dict[str, pathlib.Path]
@@ -60,7 +60,7 @@ def test_a_scene_that_goes_on_in_the_next_shard_keeps_its_number(data: Data, tmp
     rows = np.concatenate([np.zeros(4, int), np.full(5, 4)])
     for index, some in enumerate((rows[:5], rows[5:])):
         shards.write_shard(tmp_path, index, episodes[some], kind="push", config={}, faults={})
-    records.update_manifest(tmp_path)
+    manifest.update_manifest(tmp_path)
     found = source.open_source(tmp_path)
     assert found.cut == 4 and [part.name for part in found.parts()] == ["train-00000", "test-00000", "test-00001"]
     scenes = [found.read(part)[2].tolist() for part in found.parts()]

@@ -12,6 +12,7 @@ from dipn_jax.datagen import cli, upkeep
 from dipn_jax import console, files, machine
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, records, shards
+from dipn_jax.storage.manifest import MANIFEST, update_manifest
 
 COMMAND = ("push", "--episodes", "24", "--shard-size", "16")
 
@@ -24,7 +25,7 @@ def copy(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> pathlib.Path:
 def _without(folder: pathlib.Path, index: int) -> None:
     """Let a data set be as if the worker of a shard had never run."""
     shards.shard_path(folder, index).unlink()
-    records.update_manifest(folder)
+    update_manifest(folder)
 
 
 def test_a_whole_data_set_misses_nothing(copy: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,7 +159,7 @@ def test_everybody_who_made_shards_is_listed_and_a_mix_is_said(
     monkeypatch.setattr(files, "package_versions", lambda: alone["versions"] | {"mujoco": "9.9"})
     episodes = shards.read_shard(shards.shard_path(copy, 1), kind="push")
     shards.write_shard(copy, 1, episodes, kind="push", config={}, faults={})
-    records.update_manifest(copy)
+    update_manifest(copy)
     made_by: list[dict[str, Any]] = records.summary(copy)["made_by"]
     assert [one["shards"] for one in made_by] == [1, 1]
     upkeep.info(copy)
@@ -177,8 +178,8 @@ def test_a_shard_that_does_not_say_who_made_it_is_read(copy: pathlib.Path) -> No
         meta = json.loads(table.schema.metadata[b"dipn_jax"])
         del meta["processor"], meta["instructions"]
         pyarrow.parquet.write_table(table.replace_schema_metadata({"dipn_jax": json.dumps(meta)}), path)
-    (copy / records.MANIFEST).unlink()
-    records.update_manifest(copy)
+    (copy / MANIFEST).unlink()
+    update_manifest(copy)
     (one,) = records.summary(copy)["made_by"]
     assert (one["processor"], one["instructions"], one["shards"]) == ("not recorded", "not recorded", 2)
     assert len(records.load(copy, kind="push")[0].fault) == 24

@@ -12,6 +12,7 @@ import pytest
 from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import codec, records, shards
+from dipn_jax.storage.manifest import MANIFEST, update_manifest
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def test_the_wrong_kind_a_missing_and_an_old_data_set_are_named(copy: pathlib.Pa
         records.load(copy, kind="grasp")
     with pytest.raises(UserError, match="no manifest"):
         records.load(tmp_path / "nowhere", kind="push")
-    (copy / records.MANIFEST).write_text("{")
+    (copy / MANIFEST).write_text("{")
     with pytest.raises(UserError, match="damaged"):
         records.load(copy, kind="push")
 
@@ -101,7 +102,7 @@ def test_a_shard_of_version_2_is_read_and_stands_beside_new_ones(copy: pathlib.P
     shards.write_shard(folder, 1, old, kind="push", config={}, faults={})
     meta = shards.read_meta(shards.shard_path(folder, 1))
     assert meta["schema_version"] == 3 and meta["columns"]["poses"]["code"] == "value"
-    records.update_manifest(folder)
+    update_manifest(folder)
     assert records.verify(folder) == []
     both, _ = records.load(folder, kind="push")
     np.testing.assert_array_equal(both.poses[:5], both.poses[5:])
@@ -119,7 +120,7 @@ def test_the_fingerprint_follows_the_content(copy: pathlib.Path) -> None:
     before = records.load(copy, kind="push")[1]
     assert records.load(copy, kind="push")[1] == before
     shards.shard_path(copy, 1).unlink()
-    records.update_manifest(copy)
+    update_manifest(copy)
     assert records.load(copy, kind="push")[1] != before
 
 
@@ -166,7 +167,7 @@ def test_a_manifest_with_entries_of_other_types_is_damaged(copy: pathlib.Path, k
     manifest = json.loads((copy / "manifest.json").read_text())
     manifest["shards"]["shard-00001.parquet"][key] = value
     (copy / "manifest.json").write_text(json.dumps(manifest))
-    for look in (records.verify, records.summary, records.update_manifest):
+    for look in (records.verify, records.summary, update_manifest):
         with pytest.raises(UserError, match=r"manifest\.json is damaged; run dipn-datagen repair") as caught:
             look(copy)
         assert "\n" not in str(caught.value)
@@ -185,11 +186,11 @@ def test_a_manifest_that_counts_other_episodes_is_wrong(copy: pathlib.Path) -> N
 def test_where_files_cannot_be_locked_the_manifest_is_written_all_the_same(tmp_path: pathlib.Path) -> None:
     script = (
         "import pathlib, sys; sys.modules['fcntl'] = None\n"  # as where there is no such module
-        "from dipn_jax.storage import records\n"
-        "assert records.update_manifest(pathlib.Path(sys.argv[1]))['episodes'] == 0"
+        "from dipn_jax.storage import manifest\n"
+        "assert manifest.update_manifest(pathlib.Path(sys.argv[1]))['episodes'] == 0"
     )
     subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
-    assert (tmp_path / records.MANIFEST).is_file()
+    assert (tmp_path / MANIFEST).is_file()
 
 
 def _no_locks(*_: object) -> None:
@@ -209,5 +210,5 @@ def test_without_locks_a_shard_that_comes_while_the_manifest_is_written_is_liste
         write(path, value)
 
     monkeypatch.setattr(files, "write_json", slow)
-    assert set(records.update_manifest(copy)["shards"]) == {"shard-00000.parquet", late.name}
+    assert set(update_manifest(copy)["shards"]) == {"shard-00000.parquet", late.name}
     assert records.verify(copy) == []

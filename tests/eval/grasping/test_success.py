@@ -12,7 +12,7 @@ import pytest
 from dipn_jax.eval.clearing import instances, lockstep, on_tables
 from dipn_jax.eval.clearing.camera import Camera
 from dipn_jax.eval.clearing.instances import Instance
-from dipn_jax.eval.grasping import success
+from dipn_jax.eval.grasping import rates, success
 
 from dipn_jax import geometry, structs
 from dipn_jax.planning import planner, scorers
@@ -68,6 +68,13 @@ def _table(did: list[str], place: str, *, friction: float = 0.5, mass: float = 0
     return Instance("x", scene, poses + 1, 1, did=did, film=film)
 
 
+def _others(tables: list[Instance], count: int) -> dict[str, float]:
+    """Return what is said of the grasps that are tried after a miss."""
+    found = success._other_grasps(peaks, Lifts(), tables, count)  # type: ignore[arg-type]
+    attempts = np.zeros(sum(len(table.did) for table in tables), int)
+    return rates._other_rates(found | {"table": attempts}, count)
+
+
 def test_the_ceiling_counts_the_misses_that_a_next_best_grasp_would_have_held() -> None:
     tables = [
         _table(["grasp missed", "grasp held", "grasp held"], "second"),
@@ -77,32 +84,32 @@ def test_the_ceiling_counts_the_misses_that_a_next_best_grasp_would_have_held() 
         _table(["grasp missed"], "second", friction=FAULTY),
         _table(["grasp held"], "second"),
     ]
-    found = success._other_grasps(peaks, Lifts(), tables, 2)  # type: ignore[arg-type]
+    found = _others(tables, 2)
     assert (found["other_grasps/missed"], found["other_grasps/tried_each"]) == (7, 2)
     assert found["other_grasps/one_holds"] == pytest.approx(3 / 7)
     assert found["other_grasps/ceiling"] == pytest.approx(1 - 4 / 10)
-    one = success._other_grasps(peaks, Lifts(), tables, 1)  # type: ignore[arg-type]
+    one = _others(tables, 1)
     assert one["other_grasps/one_holds"] == pytest.approx(1 / 7)
     assert one["other_grasps/ceiling"] == pytest.approx(1 - 6 / 10)
 
 
 def test_other_grasps_are_ranked_with_the_misses_that_the_policy_knew() -> None:
     table = _table(["grasp missed"], "third")
-    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 0  # type: ignore[arg-type]
+    assert _others([table], 1)["other_grasps/one_holds"] == 0
     row, col = PEAKS["second"]  # 0.8 is halved: the third is now the next best
     table.film[0]["missed"] = np.array([[0, row, col]], np.int32)
-    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 1  # type: ignore[arg-type]
+    assert _others([table], 1)["other_grasps/one_holds"] == 1
 
 
 def test_the_grasp_that_missed_is_left_out_whatever_its_rank() -> None:
     table = _table(["grasp missed"], "first")
-    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 0  # type: ignore[arg-type]
+    assert _others([table], 1)["other_grasps/one_holds"] == 0
     table.film[0]["grasp"] = np.array([0, *PEAKS["second"]], np.int32)
-    assert success._other_grasps(peaks, Lifts(), [table], 1)["other_grasps/one_holds"] == 1  # type: ignore[arg-type]
+    assert _others([table], 1)["other_grasps/one_holds"] == 1
 
 
 def test_without_a_miss_there_is_no_ceiling() -> None:
-    found = success._other_grasps(peaks, Lifts(), [_table(["grasp held"], "second")], 3)  # type: ignore[arg-type]
+    found = _others([_table(["grasp held"], "second")], 3)
     assert found == {"other_grasps/missed": 0, "other_grasps/tried_each": 3}
 
 
@@ -118,7 +125,9 @@ def test_a_random_grasp_that_went_wrong_does_not_count() -> None:
             return seen[-1]
 
     camera = Noisy(height_noise=0.001)
-    found = success._random_foreground(peaks, Lifts(reach=1), tables, 0, camera)  # type: ignore[arg-type]
+    keys = success._random_keys(0, 3)
+    tried = success._random_foreground(peaks, Lifts(reach=1), tables, keys, camera)  # type: ignore[arg-type]
+    found = rates._random_rates(tried)
     assert np.std(seen[0].height[:, :40, 200:]) == pytest.approx(0.001, rel=0.1), "what the camera sees is grasped"
     assert found["grasp_success/random_foreground"] == pytest.approx(1 / 2)
     assert found["random/reliability/0/count"] == 2 and found["random/expected_calibration_error"] == pytest.approx(0.5)
@@ -156,7 +165,8 @@ def test_the_rates_are_of_all_grasps_and_of_the_first(monkeypatch: pytest.Monkey
         table.ended = end
     monkeypatch.setattr(instances, "random_instances", lambda *_, **__: tables)
     monkeypatch.setattr(lockstep, "clear", lambda *_, **__: tables)
-    monkeypatch.setattr(success, "_random_foreground", lambda *_: {})
+    random = {"random_usable": np.ones(4, bool), "random_success": np.ones(4, bool), "random_score": np.ones(4)}
+    monkeypatch.setattr(success, "_random_foreground", lambda *_: random)
     monkeypatch.setattr(on_tables, "in_lockstep", lambda policy, camera: policy)
     found, _ = success.evaluate(peaks, Lifts(), scenes.fixed_count(1), None, scenes=4, seed=0)  # type: ignore[arg-type]
     assert found["grasp_success/gn"] == pytest.approx(5 / 9)
@@ -168,7 +178,7 @@ def test_the_rates_are_of_all_grasps_and_of_the_first(monkeypatch: pytest.Monkey
 
 def test_calibration_weighs_the_bins_by_their_counts() -> None:
     scores, held = np.array([0.0, 0.05, 0.1, 0.62, 0.68, 0.65, 1.0, 0.94]), np.array([0, 1, 0, 1, 0, 1, 1, 0])
-    found = success.calibration(scores, held)
+    found = rates.calibration(scores, held)
     bins = {0: (2, 0.025, 1 / 2), 1: (1, 0.1, 0), 6: (3, 0.65, 2 / 3), 9: (2, 0.97, 1 / 2)}
     for b, wanted in bins.items():
         assert tuple(found[f"reliability/{b}/{key}"] for key in ("count", "score", "success")) == pytest.approx(wanted)
@@ -179,7 +189,7 @@ def test_calibration_weighs_the_bins_by_their_counts() -> None:
 
 def test_calibration_error_of_known_scores() -> None:
     for held, error in ((1, 0.05), (0, 0.95)):
-        found = success.calibration(np.full(10, 0.95), np.full(10, held))
+        found = rates.calibration(np.full(10, 0.95), np.full(10, held))
         assert found["expected_calibration_error"] == pytest.approx(error)
         assert found["reliability/9/count"] == 10 and found["reliability/9/success"] == held
 

@@ -122,8 +122,8 @@ def test_the_summary_counts_what_is_visible_and_what_moved() -> None:
     moved = np.array([[[1, 0, 0]] * 2, [[0, 0, 0], [0, 1, 0]]], bool)
     error = np.array([[[0.1, 0.2, 9.0], [0.3, 0.4, 9.0]], [[0.5, 0.6, 0.7], [0.8, 0.9, 1.0]]])
     keys = ("push_error", "push_error_paper_measure", "push_position_mm", "push_angle_deg")
-    rows = {f"a/{key}": [error[:1] * (i + 1), error[1:] * (i + 1)] for i, key in enumerate(keys)}
-    found = push_errors._summary({"visible": [visible], "moved": [moved], **rows}, ["a"], segmented=False)
+    rows = {f"a/{key}": error * (i + 1) for i, key in enumerate(keys)}
+    found = push_errors.summary({"visible": visible, "moved": moved, **rows})
     assert found["push_error/a/5cm/all"] == pytest.approx((0.1 + 0.2 + 0.5 + 0.6 + 0.7) / 5)
     assert found["push_error_paper_measure/a/10cm/all"] == pytest.approx(2 * (0.3 + 0.4 + 0.8 + 0.9 + 1.0) / 5)
     assert found["push_error/a/5cm/moved"] == pytest.approx(0.1)

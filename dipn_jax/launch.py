@@ -1,0 +1,147 @@
+"""Tasks of a job, on the machines of a Ray cluster. Importing this imports neither Ray nor JAX.
+
+A task writes its result to the folder that all machines share, and returns a few words about it. One that is lost, with
+its process or its machine, is run again, as often as need be; a mistake of the user's ends the job with its line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+from collections.abc import Callable, Generator, Iterator, Sequence
+from typing import Any, Literal
+
+from dipn_jax import console, machine
+from dipn_jax.errors import UserError
+from dipn_jax.interruption import STOPS
+
+AHEAD = 2
+"""Tasks that are submitted for each one that the cluster can run at a time."""
+STORE_BYTES = 100 * 2**20
+"""Memory for results of tasks, on a cluster that is started here: they are a few words."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Launch:
+    """Where a job runs."""
+
+    launcher: Literal["local", "ray"] = "local"
+    """local: in this process; ray: as tasks of the cluster at RAY_ADDRESS, or of one started on this machine."""
+    num_cpus: float = 1.0
+    """Cores that ray reserves for each task; native simulates on as many threads, unless --threads says otherwise."""
+    num_gpus: float = 0.0
+    """GPUs that ray reserves for each task."""
+
+    def __post_init__(self) -> None:
+        console.require_between(0.01, 4096, num_cpus=self.num_cpus)
+        console.require_between(0, 64, num_gpus=self.num_gpus)
+        if self.launcher == "local" and (self.num_cpus, self.num_gpus) != (1.0, 0.0):
+            raise UserError("--num-cpus, --num-gpus: for --launcher ray only; here, give --threads")
+
+    @property
+    def spreads(self) -> bool:
+        """Whether the job runs as tasks."""
+        return self.launcher != "local"
+
+    def threads(self, given: int | None) -> int | None:
+        """Return the threads that native simulates on: those that are given, or for a task one a core of its own."""
+        return max(1, int(self.num_cpus)) if self.spreads and given is None else given
+
+
+LOCAL = Launch()
+"""Everything in this process."""
+
+
+def run(
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, launch: Launch
+) -> Generator[tuple[int, Any], None, None]:
+    """Call `function(*task)` for every task, on the cluster; yield number and result of each as it ends.
+
+    Args:
+      function: of a module of this package, which every machine of the cluster has.
+      tasks: arguments of each call.
+      launch: what a task needs.
+
+    Raises:
+      UserError: a task raised it, and the others are given up; or there is no Ray or no cluster.
+    """
+    with _connected() as ray:
+        _warn_of_too_little(ray, launch)
+        needs = {"num_cpus": launch.num_cpus, "num_gpus": launch.num_gpus}
+        remote = ray.remote(max_retries=-1, retry_exceptions=False, **needs)(_attempt)
+        waiting, going = list(enumerate(tasks))[::-1], dict[Any, int]()
+        try:
+            while waiting or going:
+                while waiting and len(going) < _window(ray, launch):
+                    number, task = waiting.pop()
+                    going[remote.remote(function, task)] = number
+                for done in ray.wait(list(going), num_returns=1)[0]:
+                    number = going.pop(done)
+                    result, said = ray.get(done)
+                    if said is not None:
+                        raise UserError(said)
+                    yield number, result
+        finally:
+            for left in going:
+                ray.cancel(left, force=True)
+
+
+def _attempt(function: Callable[..., Any], task: tuple[Any, ...]) -> tuple[Any, str | None]:
+    """Return what a task returns, or else the line that says what the user has to mend; another error is raised."""
+    console.enable_compilation_cache()
+    try:
+        return function(*task), None
+    except UserError as error:
+        return None, str(error)
+    except OSError as error:
+        return None, console.mended(error)
+
+
+def _window(ray: Any, launch: Launch) -> int:
+    """Return how many tasks are submitted at a time, so that no machine waits for one and the cluster keeps few."""
+    there = ray.cluster_resources()
+    asked = [(there.get("CPU", 0.0), launch.num_cpus), (there.get("GPU", 0.0), launch.num_gpus)]
+    return max(AHEAD, AHEAD * int(min(has / need for has, need in asked if need)))
+
+
+def _warn_of_too_little(ray: Any, launch: Launch) -> None:
+    """Say if no machine of the cluster has what a task needs: it then waits for one that has."""
+    alive = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    needs = {"CPU": launch.num_cpus, "GPU": launch.num_gpus}
+    if not any(all(node.get(name, 0.0) >= need for name, need in needs.items()) for node in alive):
+        console.warn(f"no machine of the cluster has {launch.num_cpus:g} cores and {launch.num_gpus:g} GPUs; waiting")
+
+
+@contextlib.contextmanager
+def _connected() -> Iterator[Any]:
+    """Return Ray, connected to a cluster within a `with` statement."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError:
+        raise UserError("--launcher ray: Ray is not installed; pip install 'dipn-jax[ray]'") from None
+    if ray.is_initialized():
+        yield ray
+        return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *STOPS)}
+    quiet = {"log_to_driver": False, "logging_level": "ERROR"}
+    address = os.environ.get("RAY_ADDRESS")
+    try:
+        if address:
+            ray.init(address, **quiet)
+        else:
+            here = {"num_cpus": machine.cores(), "object_store_memory": STORE_BYTES, "include_dashboard": False}
+            ray.init("local", **here, **quiet)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        why = " ".join(str(error).split())[:200]
+        at = f"no cluster at RAY_ADDRESS={address}" if address else "no cluster could be started here"
+        raise UserError(f"--launcher ray: {at} ({why}); start one with `ray start --head`") from None
+    try:
+        with contextlib.suppress(ValueError):  # only the main thread may
+            for number, handler in handlers.items():  # Ray has set its own
+                signal.signal(number, handler)
+        yield ray
+    finally:
+        ray.shutdown()

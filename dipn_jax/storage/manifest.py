@@ -1,0 +1,153 @@
+"""The list of a data set's shards: `manifest.json`, with their sizes and SHA-256.
+
+It is a function of the shards, and is written when generation ends. Whoever reads a data set looks for shards that it
+does not list, because generation goes on or was killed, and takes them as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import pathlib
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+from dipn_jax import console, files, typed
+from dipn_jax.errors import UserError
+from dipn_jax.storage import layout, shards
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+MANIFEST = "manifest.json"
+"""Name of the file that lists the shards of a data set."""
+_FORM = {
+    "kind": typed.Maybe(set(layout.KINDS)),
+    "shards": {
+        str: {
+            "episodes": typed.Whole(1),
+            "bytes": typed.Whole(),
+            "sha256": str,
+            "kind": set(layout.KINDS),
+            "faults": {str: typed.Whole()},
+        }
+    },
+}
+"""Form of the manifest."""
+
+
+def update_manifest(folder: pathlib.Path, *, made: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """List every readable shard of the folder in `manifest.json`, and return the manifest.
+
+    Entries of missing shards are dropped; a shard that is listed already is not read again. Workers that share the
+    folder take turns, where the system can lock files. Where it cannot, the last one to write looks again whether
+    shards were added while it wrote, so that none stays unlisted.
+
+    Args:
+      folder: the data set.
+      made: entries by name, as `shards.write_shard` returns them: of shards that need not be read for it.
+    """
+    with _turn(folder) as alone:
+        manifest = _rebuild(folder, made or {})
+        while not alone and set(manifest["shards"]) != {path.name for path in shards.shard_files(folder)}:
+            manifest = _rebuild(folder, made or {})  # somebody whom no lock kept waiting has added a shard
+        return manifest
+
+
+def forget(folder: pathlib.Path, names: Collection[str]) -> None:
+    """Take shards out of the manifest that are about to be made anew; it is left alone if it lists none of them."""
+    if not (folder / MANIFEST).exists():
+        return
+    with _turn(folder):
+        known = _read(folder)["shards"]
+        if not known.keys().isdisjoint(names):
+            _write(folder, {name: entry for name, entry in known.items() if name not in names})
+
+
+@contextlib.contextmanager
+def _turn(folder: pathlib.Path) -> Iterator[bool]:
+    """Wait until no other worker writes the manifest; say whether that can be known."""
+    with (folder / ".lock").open("wb") as lock:
+        try:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            alone = fcntl is not None
+        except OSError:
+            _warn_of_no_locks(folder)
+            alone = False
+        yield alone
+
+
+@functools.cache
+def _warn_of_no_locks(folder: pathlib.Path) -> None:
+    """Say once a process that workers cannot take turns."""
+    console.warn(f"{folder}: its file system has no locks; workers list their shards without taking turns")
+
+
+def _rebuild(folder: pathlib.Path, made: Mapping[str, Any]) -> dict[str, Any]:
+    """Write the manifest anew, as `update_manifest` says, and return it."""
+    known = (_read(folder)["shards"] if (folder / MANIFEST).exists() else {}) | dict(made)
+    entries: dict[str, Any] = {}
+    for path in shards.shard_files(folder):
+        entry = known.get(path.name)
+        if entry is None or entry["bytes"] != path.stat().st_size:
+            entry = shards.entry(path)
+        entries[path.name] = entry
+    return _write(folder, entries)
+
+
+def _write(folder: pathlib.Path, entries: dict[str, Any]) -> dict[str, Any]:
+    """Write a manifest that lists these shards, and return it."""
+    manifest = {
+        "schema_version": shards.SCHEMA_VERSION,
+        "kind": next((entry["kind"] for entry in entries.values()), None),
+        "episodes": sum(entry["episodes"] for entry in entries.values()),
+        "shards": entries,
+    }
+    files.write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def _read(folder: pathlib.Path) -> dict[str, Any]:
+    """Return the manifest of a data set; raise UserError if it is missing or damaged."""
+    path = folder / MANIFEST
+    try:
+        manifest: dict[str, Any] = typed.check(typed.parse(path.read_bytes()), _FORM)
+        for name in manifest["shards"]:
+            if "/" in name or not (name.startswith("shard-") and name.endswith(".parquet")):
+                raise typed.Misfit(f"{typed.brief(name)} is no name of a shard")
+            typed.inside(folder, name)
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"data set {folder}: no {MANIFEST}; give a folder that dipn-datagen wrote") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); mend that, or give another folder") from None
+    except typed.Misfit as error:
+        raise UserError(
+            f"data set {folder}: {MANIFEST} is damaged; run dipn-datagen repair {folder} ({error})"
+        ) from None
+    return manifest
+
+
+def listed(folder: pathlib.Path) -> dict[str, Any]:
+    """Return what the manifest lists; nothing where generation has begun and no manifest is written yet."""
+    if not (folder / MANIFEST).exists() and (folder / "config.json").is_file():
+        return {}
+    return dict(_read(folder)["shards"])
+
+
+def unlisted(folder: pathlib.Path, known: Mapping[str, Any]) -> list[pathlib.Path]:
+    """Return the shards that are there and not listed: of a generation that goes on, or was killed."""
+    return [path for path in shards.shard_files(folder) if path.name not in known]
+
+
+def entries(folder: pathlib.Path) -> dict[str, Any]:
+    """Return an entry for every shard by its name, in order: of those that the manifest lists, and of others.
+
+    Raises:
+      UserError: the folder is no data set, its manifest is damaged, or a shard that is not listed.
+    """
+    known = listed(folder)
+    found = known | {path.name: shards.entry(path) for path in unlisted(folder, known)}
+    return dict(sorted(found.items()))

@@ -1,0 +1,90 @@
+"""One evaluation of predictions from the parts of several workers."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from dipn_jax import files, typed
+from dipn_jax.errors import UserError
+from dipn_jax.storage import arrays
+from dipn_jax.storage.arrays import Form
+
+from .. import curves
+from ..shares import PART, Part
+from . import push_errors
+from .push_errors import DISTANCES
+
+ERRORS, FILMS = "errors.npz", "films.npz"
+"""Names of the files with the errors of every push, and with pictures of some."""
+
+
+def save(out: pathlib.Path, rows: Mapping[str, np.ndarray], films: Mapping[str, np.ndarray]) -> list[str]:
+    """Write what was measured for a part, and return the names of the files."""
+    files.write_atomically(out / ERRORS, arrays.dumps(rows))
+    if not films:
+        return [ERRORS]
+    save_films(out, films)
+    return [ERRORS, FILMS]
+
+
+def save_films(out: pathlib.Path, films: Mapping[str, np.ndarray]) -> None:
+    """Write the pictures of some pushes."""
+    files.write_atomically(out / FILMS, arrays.dumps(films))
+
+
+def _form(name: str) -> Form:
+    return Form("iu", ("B",)) if name == "group" else Form("fb", ("B", len(DISTANCES), "N"))
+
+
+def pooled(parts: Sequence[Part], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the errors of all parts, in the order of their groups.
+
+    Raises:
+      UserError: a part is damaged.
+    """
+    found = []
+    for part in parts:
+        try:
+            found.append(arrays.read(part.path(ERRORS), {name: _form(name) for name in names}))
+        except typed.Misfit as error:
+            raise UserError(f"{part.folder / ERRORS}: damaged, {error}; {part.again()}") from None
+    places = np.argsort(np.concatenate([each["group"] for each in found]), kind="stable")
+    return {name: np.concatenate([each[name] for each in found])[places] for name in names}
+
+
+def merge(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:
+    """Write what `dipn-eval prediction` writes beside its metrics, and return these."""
+    first = parts[0]
+    try:
+        about = typed.check(first.about, {"arrays": [str], "compared": [str]})
+        if not {"group", "visible", "moved"} <= set(about["arrays"]):
+            raise typed.Misfit("arrays are missing")
+    except typed.Misfit as error:
+        raise UserError(f"{first.folder / PART}: damaged, {error}; {first.again()}") from None
+    rows = pooled(parts, about["arrays"])
+    files.write_atomically(out / FILMS, first.path(FILMS).read_bytes())
+    try:
+        return finish(out, rows, about["compared"])
+    except KeyError as error:
+        raise UserError(f"{first.folder / PART}: damaged, {error} is missing; {first.again()}") from None
+
+
+def finish(out: pathlib.Path, rows: Mapping[str, np.ndarray], compared: Sequence[str]) -> dict[str, Any]:
+    """Return the metrics of all pushes; draw the learning curve where there is one.
+
+    Args:
+      out: folder of the results.
+      rows: errors of all pushes, as `push_errors.measured` returns them.
+      compared: names of the networks of a learning curve.
+    """
+    values = push_errors.summary(rows)
+    kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in compared)}
+    values = kept | curves.push_summary(values, compared)
+    for which in ("all", "moved") if compared else ():
+        curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
+        files.write_text(out / f"curve-{which}.md", curves.push_table(values, which=which))
+    return values

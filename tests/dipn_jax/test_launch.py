@@ -1,0 +1,97 @@
+"""Tasks that are lost are run again, and a user's mistake ends the job; with a stand-in for Ray."""
+
+import sys
+import types
+from typing import Any
+
+import pytest
+
+from dipn_jax import launch
+from dipn_jax.errors import UserError
+from dipn_jax.launch import LOCAL, Launch
+
+
+class _Ray(types.ModuleType):
+    """Runs tasks when they are waited for, the last one first."""
+
+    def __init__(self, cores: float = 2.0) -> None:
+        super().__init__("ray")
+        self.cores, self.options = cores, dict[str, Any]()
+        self.most_going, self.cancelled = 0, list[Any]()
+
+    def is_initialized(self) -> bool:
+        return True
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": self.cores}
+
+    def nodes(self) -> list[dict[str, Any]]:
+        return [{"Alive": True, "Resources": {"CPU": self.cores}}, {"Alive": False, "Resources": {"CPU": 64.0}}]
+
+    def remote(self, **options: Any) -> Any:
+        self.options = options
+        return lambda function: types.SimpleNamespace(remote=lambda *args: (function, args))
+
+    def wait(self, going: list[Any], *, num_returns: int) -> tuple[list[Any], list[Any]]:
+        self.most_going = max(self.most_going, len(going))
+        return going[-num_returns:], going[:-num_returns]
+
+    def get(self, task: Any) -> Any:
+        function, args = task
+        return function(*args)
+
+    def cancel(self, task: Any, *, force: bool) -> None:
+        self.cancelled.append(task)
+
+
+@pytest.fixture
+def ray(monkeypatch: pytest.MonkeyPatch) -> _Ray:
+    stand_in = _Ray()
+    monkeypatch.setitem(sys.modules, "ray", stand_in)
+    return stand_in
+
+
+def _double(number: int) -> int:
+    if number == 5:
+        raise UserError("five: want another number")
+    if number == 6:
+        raise OSError(28, "No space left on device", "/data")
+    return 2 * number
+
+
+def test_every_task_is_done_once_and_few_are_submitted_at_a_time(ray: _Ray) -> None:
+    tasks = [(number,) for number in range(20, 40)]
+    found = dict(launch.run(_double, tasks, launch=Launch("ray", num_cpus=1.0)))
+    assert found == {number: 2 * (20 + number) for number in range(20)}
+    assert ray.most_going == 4 and ray.cancelled == []
+    assert ray.options == {"num_cpus": 1.0, "num_gpus": 0.0, "max_retries": -1, "retry_exceptions": False}
+
+
+@pytest.mark.parametrize(("number", "says"), [(5, "five: want another number"), (6, "/data: No space left on device")])
+def test_a_mistake_of_the_users_ends_the_job_and_the_others_are_given_up(number: int, says: str, ray: _Ray) -> None:
+    with pytest.raises(UserError, match=says):
+        list(launch.run(_double, [(1,), (2,), (number,), (3,), (4,)], launch=Launch("ray")))
+    assert [task[1] for _, task in ray.cancelled] == [(1,), (2,)]
+
+
+def test_what_no_machine_has_is_said(ray: _Ray, capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(launch.run(_double, [], launch=Launch("ray", num_cpus=2.0))) == []
+    assert capsys.readouterr().err == ""
+    assert list(launch.run(_double, [], launch=Launch("ray", num_cpus=3.0, num_gpus=1.0))) == []
+    assert capsys.readouterr().err == "warning: no machine of the cluster has 3 cores and 1 GPUs; waiting\n"
+
+
+def test_without_ray_a_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UserError, match=r"--launcher ray: Ray is not installed; pip install 'dipn-jax\[ray\]'"):
+        list(launch.run(_double, [(1,)], launch=Launch("ray")))
+
+
+def test_a_task_has_as_many_threads_as_cores() -> None:
+    assert LOCAL.threads(None) is None and LOCAL.threads(0) == 0 and LOCAL.threads(3) == 3
+    assert [Launch("ray", num_cpus=cores).threads(None) for cores in (0.5, 1.0, 4.0)] == [1, 1, 4]
+    assert Launch("ray", num_cpus=4.0).threads(2) == 2
+    with pytest.raises(UserError, match="--num-cpus, --num-gpus: for --launcher ray only"):
+        Launch(num_cpus=2.0)
+    with pytest.raises(UserError, match="--num-cpus 0"):
+        Launch("ray", num_cpus=0.0)

@@ -1,0 +1,105 @@
+"""Evaluations whose parts are tasks end as those of one worker, whatever is lost meanwhile."""
+
+import importlib.util
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from dipn_jax.eval import cli, spread
+
+from dipn_jax import console, launch
+from dipn_jax.launch import Launch
+
+WORDS = ("clear", "--method", "gn", "--cases", "random", "--objects", "1", "--instances", "3", "--aids")
+"""A small evaluation."""
+
+
+def _run(out: pathlib.Path, network: pathlib.Path, *words: str) -> int:
+    options = ["--grasp-net", str(network), "--engine", "native", "--out", str(out), *words]
+    return console.run("test", cli.COMMANDS, [*WORDS, *options])
+
+
+@pytest.fixture
+def parts_of_one(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Let tasks be called here, each twice, as one is whose worker is lost at its end; return their numbers."""
+    called: list[int] = []
+
+    def run(function: Any, tasks: Any, *, launch: Launch) -> Iterator[tuple[int, Any]]:
+        for number, task in enumerate(tasks):
+            function(*task)
+            called.append(task[1]["share"].shard)
+            yield number, function(*task)
+
+    monkeypatch.setattr(launch, "run", run)
+    return called
+
+
+def test_tasks_make_the_evaluation_of_one_worker_and_a_second_start_only_what_is_missing(
+    parts_of_one: list[int],
+    tiny: dict[str, pathlib.Path],
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    out, net, ray = tmp_path / "out", tiny["grasp"], ("--launcher", "ray", "--of", "3")
+    assert _run(tmp_path / "alone", net) == 0
+    make = spread.make_part
+
+    def stopped(kind: str, given: dict[str, Any]) -> None:
+        if given["share"].shard == 1:
+            (out / "parts" / ".00001-of-00003.1-abc.tmp").mkdir()  # of a task that is lost
+            raise KeyboardInterrupt
+        make(kind, given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(spread, "make_part", stopped)
+        assert _run(out, net, *ray) == 130
+    assert parts_of_one == [0] and not (out / "metrics.json").exists()
+    assert _run(out, net, *ray, "--num-cpus", "2") == 0
+    assert parts_of_one == [0, 1, 2]
+    for name in ("metrics.json", "episodes.json", "episodes/002.npz"):
+        assert (out / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+    assert sorted(path.name for path in (out / "parts").iterdir()) == [f"{i:05d}-of-00003" for i in range(3)]
+    assert not (out / "owner.json").exists()
+    capfd.readouterr()
+    assert _run(out, net, *ray, "--seed", "7") == 2
+    assert "holds another part of an evaluation" in capfd.readouterr().err and parts_of_one == [0, 1, 2]
+
+
+def test_a_mistake_of_the_users_in_a_task_is_one_line(
+    parts_of_one: list[int],
+    tiny: dict[str, pathlib.Path],
+    tmp_path: pathlib.Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray", "--of", "4") == 2
+    said = capfd.readouterr().err
+    assert "--of 4: more workers than the 3 that can be shared" in said and "Traceback" not in said
+    assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray") == 2
+    assert "--launcher ray makes all shards: give --of" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install '.[ray]'")
+def test_a_cluster_that_loses_workers_makes_the_evaluation_of_one_machine(
+    tiny: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Workers are killed when the first part is there."""
+    import ray_cluster
+
+    run, lost = launch.run, []
+
+    def losing(*args: Any, **named: Any) -> Iterator[tuple[int, Any]]:
+        for one in run(*args, **named):
+            if not lost:
+                lost.append(ray_cluster.kill_workers(cluster))
+            yield one
+
+    assert _run(tmp_path / "alone", tiny["grasp"]) == 0
+    with ray_cluster.of_nodes(2) as cluster:
+        monkeypatch.setattr(launch, "run", losing)
+        assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray", "--of", "3") == 0
+    assert lost and lost[0] >= 1
+    for name in ("metrics.json", "episodes.json", "episodes/002.npz"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()

@@ -1,0 +1,43 @@
+"""A Ray cluster of several nodes on this machine, and how some of it is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pathlib
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+
+@contextlib.contextmanager
+def of_nodes(count: int) -> Iterator[Any]:
+    """Start a cluster of a head without cores and `count` nodes with one core each; connect to it."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    import ray
+    from ray.cluster_utils import Cluster
+
+    small = {"object_store_memory": 100 * 2**20}
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False, **small})
+    try:
+        cluster.nodes = [cluster.add_node(num_cpus=1, **small) for _ in range(count)]
+        ray.init(cluster.address, log_to_driver=False, logging_level="ERROR")
+        yield cluster
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+
+def kill_workers(cluster: Any) -> int:
+    """Kill every process of the cluster's nodes that runs a task, and return how many there were."""
+    raylets = {info.process.pid for node in cluster.nodes for info in node.all_processes["raylet"]}
+    killed = 0
+    for folder in pathlib.Path("/proc").iterdir():
+        with contextlib.suppress(OSError):  # it has ended
+            if not folder.name.isdecimal():
+                continue
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent in raylets and b"_attempt" in (folder / "cmdline").read_bytes():
+                os.kill(int(folder.name), signal.SIGKILL)
+                killed += 1
+    return killed
