@@ -50,7 +50,6 @@ LINES = (
     ("triangular_prism", "cylinder", None),
 )
 
-
 FOUR_DEVICES = """
 import jax, numpy as np
 from dipn_jax import console
