@@ -137,6 +137,26 @@ PROMISES = (
             f"{_STORAGE}/test_owner.py::test_without_locks_the_file_is_made_exclusively_and_that_is_said",
         ),
     ),
+    Promise(
+        "A node or a worker of a Ray cluster that is lost costs its task only, which is tried again; data sets and "
+        "evaluations are those of one machine, byte for byte. (Skipped where Ray is not installed.)",
+        (
+            "tests/datagen/test_spread.py::test_nodes_and_workers_that_are_lost_change_nothing",
+            "tests/eval/test_shares.py::test_parts_make_the_very_evaluation_of_one_worker",
+        ),
+    ),
+    Promise(
+        "A training that devices or processes share learns what one device learns, but for rounding; an interruption "
+        "of one process ends all with a checkpoint, from which any number of devices goes on.",
+        ("tests/train/test_devices.py::test_four_devices_learn_what_one_does_and_one_goes_on_from_there",),
+    ),
+    Promise(
+        "Data sets are joined whole or not at all, and exports that were interrupted are continued to the same bytes.",
+        (
+            "tests/datagen/test_merging.py::test_an_interrupted_merge_continues",
+            "tests/datagen/exporting/test_export.py::test_an_interrupted_export_ends_as_an_undisturbed_one",
+        ),
+    ),
 )
 """What runs promise, the tests that fail where it is broken, and what was counted."""
 
