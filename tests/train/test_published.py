@@ -3,6 +3,7 @@
 import pathlib
 import re
 import shlex
+import types
 from typing import Any
 
 import jax
@@ -41,8 +42,13 @@ def _smooth_l1(error: np.ndarray) -> np.ndarray:
 
 def test_the_command_on_the_help_page_trains_as_published(monkeypatch: pytest.MonkeyPatch) -> None:
     got: dict[str, Any] = {}
-    monkeypatch.setattr(push, "PushTask", lambda data, network, **options: got.update(options, preset=network.preset))
-    monkeypatch.setattr(cli, "_fit", lambda task, config, out, **_: got.update(config=config))
+
+    def task(data: Any, network: Any, **options: Any) -> Any:
+        got.update(options, preset=network.preset)
+        return types.SimpleNamespace(close=lambda: None)
+
+    monkeypatch.setattr(push, "PushTask", task)
+    monkeypatch.setattr(cli, "_fit", lambda task, config, *_, **__: got.update(config=config))
     (command,) = re.findall(r"dipn-train (push .*--preset paper(?:.*\\\n)*.*)", cli.push.__doc__ or "")
     assert console.run("test", cli.COMMANDS, shlex.split(command.replace("\\\n", " "))) == 0
     assert got["config"] == PUBLISHED and got["config"].steps * got["config"].batch == 50 * got["limit"]
