@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
 import sys
+import tempfile
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -16,6 +19,7 @@ from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig
 if TYPE_CHECKING:
     from flax import nnx
 
+    from .example_store import Place
     from .loop import Task
 
 PUSH = TrainConfig(steps=1500, learning_rate=3e-3, eval_every=250, save_every=250)
@@ -40,6 +44,19 @@ def _join(compute: Compute) -> None:
         from . import devices
 
         devices.join(compute)
+
+
+@contextlib.contextmanager
+def _place(out: pathlib.Path, compute: Compute) -> Iterator[Place]:
+    """Say where the examples of a run are kept; those of a program that is only compiled are not."""
+    from .example_store import Place
+
+    console.require_between(0, 1e6, memory=compute.memory)
+    if compute.compile_only:
+        with tempfile.TemporaryDirectory() as folder:
+            yield Place(0, pathlib.Path(folder) / "examples")
+    else:
+        yield Place(compute.memory, out / "examples" / str(compute.process))
 
 
 def _initial(init: pathlib.Path | None, network: str) -> Any:
@@ -89,8 +106,10 @@ def push(
 
     found, initial = masks == "found", _initial(init, "dipn")
     network = initial.config if initial else DipnConfig(preset=preset)
-    task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found)
-    _fit(task, config, out, compute, initial=initial)
+    with _place(out, compute) as place:
+        task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found, place=place)
+        with contextlib.closing(task):
+            _fit(task, config, out, compute, initial=initial)
 
 
 def grasp_pretrain(
@@ -152,7 +171,8 @@ def grasp(
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    _fit(GraspTask(data, network), config, out, compute, initial=initial)
+    with _place(out, compute) as place, contextlib.closing(GraspTask(data, network, place=place)) as task:
+        _fit(task, config, out, compute, initial=initial)
 
 
 def export(

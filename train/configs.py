@@ -51,6 +51,9 @@ class Compute:
     each has its own statistics and random numbers."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Precision of what the network's layers compute; weights, statistics and losses stay float32."""
+    memory: float = 8.0
+    """GB of examples kept in memory, by push and grasp with compact networks. If there are more, each is made when it
+    is first used and kept in files under OUT/examples; these may be deleted afterwards."""
     compile_only: bool = False
     """Compile a step, say what memory it needs, and write nothing but the compiled program that JAX keeps."""
     profile: pathlib.Path | None = None

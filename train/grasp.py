@@ -19,6 +19,7 @@ from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, Se
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
+from .example_store import IN_MEMORY, Kept, Place
 from .split import Folders, load_sides
 
 PRETRAIN_VIEW = 192
@@ -187,12 +188,13 @@ class GraspTask:
 
     network = "grasp"
 
-    def __init__(self, data: Folders, config: grasp.GraspConfig) -> None:
+    def __init__(self, data: Folders, config: grasp.GraspConfig, *, place: Place = IN_MEMORY) -> None:
         """Load data sets.
 
         Args:
           data: folders of grasp episodes; the last tenth of each is held out.
           config: architecture.
+          place: where the windows of a `compact` network are kept.
 
         Raises:
           UserError: no folder; or one is damaged, or holds something else.
@@ -202,7 +204,15 @@ class GraspTask:
         self.size = self.examples = len(self.train_set.fault)
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
-        self._kept: dict[str, Window] = {}
+        self._kept = self._keeper(self.train_set, place)
+        self._held_out = self._keeper(self.test_set, IN_MEMORY)
+
+    def _keeper(self, episodes: GraspEpisode, place: Place) -> Kept:
+        def make(index: np.ndarray) -> Window:
+            return self.prepare(structs.take(episodes, index))
+
+        count = len(episodes.fault)
+        return Kept(make, lambda: self._prepare_all(episodes), count, place=place, about=self.fingerprint)
 
     def prepare(self, episodes: GraspEpisode) -> Window:
         """Return windows `[B]` of episodes `[B]` as NumPy arrays."""
@@ -210,14 +220,17 @@ class GraspTask:
 
     def fetch(self, index: np.ndarray) -> Window:
         """See `loop.Task`."""
-        return self._take("train", self.train_set, index)
+        return self._take(self._kept, self.train_set, index)
 
-    def _take(self, name: str, episodes: GraspEpisode, index: np.ndarray) -> Window:
+    def close(self) -> None:
+        """Let another process take up the windows that are kept in files."""
+        self._kept.close()
+
+    def _take(self, kept: Kept, episodes: GraspEpisode, index: np.ndarray) -> Window:
         if self.network_config.preset == "paper":
             return self.prepare(structs.take(episodes, index))
-        if name not in self._kept:
-            self._kept[name] = self._prepare_all(episodes)
-        return structs.take(self._kept[name], index)
+        taken: Window = kept.take(index)
+        return taken
 
     def _prepare_all(self, episodes: GraspEpisode) -> Window:
         made, count, some = [], len(episodes.fault), 8 * batching.BATCH
@@ -238,7 +251,7 @@ class GraspTask:
         for begin in range(0, count, size):
             index = np.arange(begin, begin + size)
             weight = (index < count).astype(np.float32)
-            some = self._take("test", self.test_set, index % count)
+            some = self._take(self._held_out, self.test_set, index % count)
             rows.append([float(v) for v in _measure(graph, state, some, weight)])
         loss, correct = np.array(rows).sum(0) / count
         return {"held_out_loss": loss, "accuracy": correct}

@@ -21,6 +21,7 @@ from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
+from .example_store import IN_MEMORY, Kept, Place
 from .split import Folders, load_sides
 
 
@@ -47,6 +48,7 @@ class PushTask:
         centimetres: tuple[int, ...],
         without: tuple[str, ...] = (),
         found: bool = False,
+        place: Place = IN_MEMORY,
     ) -> None:
         """Load data sets.
 
@@ -57,6 +59,7 @@ class PushTask:
           centimetres: distances learnt, each 1 to 10.
           without: leave out scenes with an object of these classes (`shapes.CLASSES`).
           found: masks are found in the image by `segment`, not taken from the simulator.
+          place: where the examples of a `compact` network are kept.
         """
         if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
             raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
@@ -78,16 +81,25 @@ class PushTask:
         self.centimetres = np.array(centimetres, np.int32)
         self.found = found
         self.slots = sides.slots
-        self._kept: Example | None = None
+        self._kept = Kept(
+            self._some, lambda: self._prepare_all(self.train_set), count, place=place, about=self.fingerprint
+        )
         self._held_out: Example | None = None
 
     def fetch(self, index: np.ndarray) -> Example:
         """See `loop.Task`. A `compact` network's examples are small, and kept once they have been rendered."""
         if self.network_config.preset == "paper":
             return self.prepare(structs.take(self.train_set, index))
-        if self._kept is None:
-            self._kept = self._prepare_all(self.train_set)
-        return structs.take(self._kept, index)
+        taken: Example = self._kept.take(index)
+        return taken
+
+    def close(self) -> None:
+        """Let another process take up the examples that are kept in files."""
+        self._kept.close()
+
+    def _some(self, index: np.ndarray) -> Example:
+        """Return the examples `index [B]` as they are kept: crops in half precision."""
+        return _halved(self.prepare(structs.take(self.train_set, index)))
 
     def prepare(self, episodes: PushEpisode) -> Example:
         """Return examples `[B]` of episodes `[B]`; rendered, and moved into the push frame, on the device."""
@@ -107,7 +119,7 @@ class PushTask:
             for begin in range(0, count, batching.BATCH):
                 rows = np.arange(begin, begin + batching.BATCH) % count
                 part: Example = structs.take(self.prepare(structs.take(episodes, rows)), slice(0, count - begin))
-                parts.append(part.replace(inputs=part.inputs.replace(crops=part.inputs.crops.astype(np.float16))))
+                parts.append(_halved(part))
                 progress.advance(len(part.taught), "")
         return structs.concatenate(parts)
 
@@ -186,6 +198,11 @@ def _mirrored(key: jax.Array, inputs: PushInput, target: Array) -> tuple[PushInp
 
     inputs = jax.tree.map(pick, push_frame.mirror(inputs), inputs)
     return inputs, pick(push_frame.mirror_motion(target), target)
+
+
+def _halved(example: Example) -> Example:
+    """Return an example whose crops are in half precision, as examples are kept."""
+    return example.replace(inputs=example.inputs.replace(crops=example.inputs.crops.astype(np.float16)))
 
 
 def _single(inputs: PushInput) -> PushInput:

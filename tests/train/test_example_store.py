@@ -1,0 +1,111 @@
+"""Examples that are kept in files: the same ones, each made once, taken up again only if they were closed."""
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from dipn_jax.train import cli
+from dipn_jax.train.example_store import ExampleStore, Kept, Place
+from dipn_jax.train.grasp import GraspTask
+from dipn_jax.train.push import PushTask
+
+from dipn_jax import batching, console
+from dipn_jax.networks.dipn import DipnConfig
+from dipn_jax.networks.grasp import GraspConfig
+
+
+class Maker:
+    """Makes examples of numbers, and notes which."""
+
+    def __init__(self) -> None:
+        self.made: list[int] = []
+
+    def __call__(self, index: np.ndarray) -> dict[str, np.ndarray]:
+        assert len(index) % batching.SMALL_BATCH == 0, "few shapes are compiled"
+        self.made += sorted(set(index.tolist()))
+        return {"square": (index**2).astype(np.float32), "row": np.stack([index, -index], 1)}
+
+
+def _store(folder: pathlib.Path, about: str = "squares") -> tuple[ExampleStore, Maker]:
+    maker = Maker()
+    return ExampleStore(folder, maker, 100, about=about), maker
+
+
+def _check(store: ExampleStore, index: list[int]) -> None:
+    found = store.take(np.array(index))
+    np.testing.assert_array_equal(found["square"], np.square(index))
+    np.testing.assert_array_equal(found["row"], np.stack([index, np.negative(index)], 1))
+    assert found["square"].dtype == np.float32
+
+
+def test_each_example_is_made_once_and_the_right_one_is_returned(tmp_path: pathlib.Path) -> None:
+    store, maker = _store(tmp_path / "s")
+    _check(store, [7, 3, 7, 99])
+    del maker.made[:]
+    _check(store, [3, 5, 99])
+    assert maker.made == [5]
+    _check(store, list(range(100)))
+    assert sorted(maker.made) == sorted({*range(100)} - {3, 7, 99})
+
+
+def test_what_was_closed_is_taken_up_and_nothing_else(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, _ = _store(tmp_path / "s")
+    _check(store, [1, 2])
+    store.close()
+    assert "GB of examples are kept there" in capsys.readouterr().out
+    again, maker = _store(tmp_path / "s")
+    _check(again, [2, 1])
+    assert maker.made == [2], "one, to see shapes"
+    cut, maker = _store(tmp_path / "s")  # `again` was not closed
+    _check(cut, [1, 2])
+    assert 1 in maker.made
+    cut.close()
+    other, maker = _store(tmp_path / "s", about="other squares")
+    _check(other, [1, 2])
+    assert 1 in maker.made
+
+
+@pytest.mark.parametrize("memory", [0.00001, 1.0])
+def test_examples_are_in_files_only_if_they_are_large(memory: float, tmp_path: pathlib.Path) -> None:
+    maker = Maker()
+    everything = lambda: maker(np.resize(np.arange(5000), 5008))  # noqa: E731
+    kept = Kept(maker, everything, 5000, place=Place(memory, tmp_path / "s"), about="squares")
+    np.testing.assert_array_equal(kept.take(np.array([4, 4000]))["square"], [16, 16_000_000])
+    kept.close()
+    assert (tmp_path / "s").exists() == (memory < 0.001) and (len(set(maker.made)) == 5000) == (memory > 0.001)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["push", "grasp"])
+def test_tasks_learn_from_the_same_examples(kind: str, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    def task(**place: Any) -> Any:
+        if kind == "push":
+            return PushTask(data["push"], DipnConfig(width=8), limit=None, centimetres=(5, 10), **place)
+        return GraspTask(data["grasp"], GraspConfig(width=8), **place)
+
+    large = task(place=Place(0, tmp_path / "s"))
+    index = np.array([3, 0, 17, 3])
+    stored, kept = large.fetch(index), task().fetch(index)
+    large.close()
+    assert (tmp_path / "s" / "whole.json").exists()
+    for one, other in zip(jax.tree.leaves(stored), jax.tree.leaves(kept), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+
+def test_the_command_keeps_them_beside_the_run_and_closes_them(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fit(task: Any, *_: Any, **__: Any) -> None:
+        task.fetch(np.array([1]))
+
+    monkeypatch.setattr(cli, "_fit", fit)
+    for extra, wanted in ((), False), (("--memory", "0"), True), (("--memory", "0", "--compile-only"), False):
+        out = tmp_path / "-".join(("run", *extra))
+        words = ["grasp", "--data", str(data["grasp"]), "--out", str(out), *extra]
+        assert console.run("test", cli.COMMANDS, words) == 0
+        assert (out / "examples" / "0" / "whole.json").exists() == wanted

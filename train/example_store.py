@@ -1,0 +1,156 @@
+"""Examples of a training, kept once they are made: in memory where they fit, else in files, made when first used."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import pathlib
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from dipn_jax import batching, console, files, structs
+
+_LARGEST = 1e6
+"""Bytes that an example takes at most: tenfold those of a push of thirty objects."""
+_WHOLE = "whole.json"
+"""File that says what the examples are of, and that none was cut off while it was written."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where examples are kept."""
+
+    memory: float = math.inf  # GB that they may take in memory
+    folder: pathlib.Path | None = None  # where they are kept if they need more; None: in memory all the same
+
+
+IN_MEMORY = Place()
+"""In memory, however large they are."""
+
+
+class Kept:
+    """The examples of a training: all made at once and kept in memory, or, if they are large, in an `ExampleStore`."""
+
+    def __init__(
+        self,
+        make: Callable[[np.ndarray], Any],
+        make_all: Callable[[], Any],
+        count: int,
+        *,
+        place: Place,
+        about: str,
+    ) -> None:
+        """Prepare to keep examples; what is not said here, `ExampleStore` says.
+
+        Args:
+          make: as of `ExampleStore`.
+          make_all: function that returns all examples as `make` makes them, and shows how far it is.
+          count: number of examples.
+          place: where to keep them.
+          about: as of `ExampleStore`.
+        """
+        self._make, self._make_all, self._count, self._place, self._about = make, make_all, count, place, about
+        self._all: Any = None
+        self._store: ExampleStore | None = None
+
+    def take(self, index: np.ndarray) -> Any:
+        """Return the examples `index [B]`."""
+        if self._all is None and self._store is None:
+            self._begin()
+        return structs.take(self._all, index) if self._store is None else self._store.take(index)
+
+    def _begin(self) -> None:
+        folder = self._place.folder
+        if folder is not None and self._size() > 1e9 * self._place.memory:
+            self._store = ExampleStore(folder, self._make, self._count, about=self._about)
+        else:
+            self._all = self._make_all()
+
+    def _size(self) -> float:
+        """Return the bytes that all examples take; none where they fit whatever they are."""
+        if self._count * _LARGEST <= 1e9 * self._place.memory:
+            return 0.0
+        some = jax.tree.leaves(self._make(_filled(np.zeros(1, int))))
+        return self._count * sum(np.asarray(leaf).nbytes / len(leaf) for leaf in some)
+
+    def close(self) -> None:
+        """See `ExampleStore.close`."""
+        if self._store is not None:
+            self._store.close()
+
+
+class ExampleStore:
+    """Examples in files that are mapped into memory: the system keeps there what it has room for.
+
+    They are taken up by a later process if the one that made them has closed them; after a hard stop they are made
+    anew.
+    """
+
+    def __init__(self, folder: pathlib.Path, make: Callable[[np.ndarray], Any], count: int, *, about: str) -> None:
+        """Prepare to keep `count` examples.
+
+        Args:
+          folder: where they are kept.
+          make: function of numbers `[B]`, one or several batches of `batching`, that returns examples `[B]`.
+          count: number of examples.
+          about: what they are examples of: the data, and how they are made.
+        """
+        self._folder, self._make, self._count, self._about = folder, make, count, about
+        self._arrays: list[np.ndarray] | None = None
+        self._structure: Any = None
+
+    def take(self, index: np.ndarray) -> Any:
+        """Return the examples `index [B]`; those that are not there yet are made."""
+        index = np.asarray(index)
+        if self._arrays is None:
+            self._open(self._make(_filled(index[:1])))
+        arrays = self._arrays
+        assert arrays is not None
+        *leaves, made = arrays
+        missing = np.unique(index[~made[index]])
+        if len(missing):
+            rows = _filled(missing)
+            for array, leaf in zip(leaves, jax.tree.leaves(self._make(rows)), strict=True):
+                array[missing] = np.asarray(leaf)[: len(missing)]
+            made[missing] = True
+        return jax.tree.unflatten(self._structure, [np.asarray(array[index]) for array in leaves])
+
+    def _open(self, some: Any) -> None:
+        """Map the files, which are made if those of another process cannot be taken up; `some` examples show shapes."""
+        leaves, self._structure = jax.tree.flatten(some)
+        shapes = [((self._count, *np.shape(leaf)[1:]), np.asarray(leaf).dtype) for leaf in leaves]
+        shapes.append(((self._count,), np.dtype(bool)))
+        about = {"about": self._about, "shapes": [[list(shape), kind.name] for shape, kind in shapes]}
+        whole = self._folder / _WHOLE
+        known = whole.exists() and files.read_json(whole) == about
+        whole.unlink(missing_ok=True)
+        if not known:
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        size = sum(int(np.prod(shape)) * kind.itemsize for shape, kind in shapes)
+        console.say(f"{self._folder}: up to {size / 1e9:.1f} GB of examples are kept there, each made when first used")
+        self._arrays = [
+            np.lib.format.open_memmap(
+                self._folder / f"{number}.npy", mode="r+" if known else "w+", dtype=kind, shape=shape
+            )
+            for number, (shape, kind) in enumerate(shapes)
+        ]
+        self._said = about
+
+    def close(self) -> None:
+        """Write what is left to the disk, so that another process can take the examples up."""
+        if self._arrays is not None:
+            for array in self._arrays:
+                array.flush()  # type: ignore[attr-defined]
+            self._arrays = None
+            files.write_json(self._folder / _WHOLE, self._said)
+
+
+def _filled(index: np.ndarray) -> np.ndarray:
+    """Return numbers repeated to fill batches of `batching`, so that few shapes are compiled."""
+    size = batching.BATCH if len(index) > batching.SMALL_BATCH else batching.SMALL_BATCH
+    return np.resize(index, -(-len(index) // size) * size)
