@@ -19,7 +19,7 @@ from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig
 if TYPE_CHECKING:
     from flax import nnx
 
-    from .example_store import Place
+    from .example_store import Room
     from .loop import Task
 
 PUSH = TrainConfig(steps=1500, learning_rate=3e-3, eval_every=250, save_every=250)
@@ -47,16 +47,16 @@ def _join(compute: Compute) -> None:
 
 
 @contextlib.contextmanager
-def _place(out: pathlib.Path, compute: Compute) -> Iterator[Place]:
+def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
     """Say where the examples of a run are kept; those of a program that is only compiled are not."""
-    from .example_store import Place
+    from .example_store import Room
 
     console.require_between(0, 1e6, memory=compute.memory)
     if compute.compile_only:
         with tempfile.TemporaryDirectory() as folder:
-            yield Place(0, pathlib.Path(folder) / "examples")
+            yield Room(0, pathlib.Path(folder) / "examples")
     else:
-        yield Place(compute.memory, out / "examples" / str(compute.process))
+        yield Room(compute.memory, out / "examples" / str(compute.process))
 
 
 def _initial(init: pathlib.Path | None, network: str) -> Any:
@@ -106,8 +106,8 @@ def push(
 
     found, initial = masks == "found", _initial(init, "dipn")
     network = initial.config if initial else DipnConfig(preset=preset)
-    with _place(out, compute) as place:
-        task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found, place=place)
+    with _room(out, compute) as room:
+        task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found, room=room)
         with contextlib.closing(task):
             _fit(task, config, out, compute, initial=initial)
 
@@ -171,7 +171,7 @@ def grasp(
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    with _place(out, compute) as place, contextlib.closing(GraspTask(data, network, place=place)) as task:
+    with _room(out, compute) as room, contextlib.closing(GraspTask(data, network, room=room)) as task:
         _fit(task, config, out, compute, initial=initial)
 
 

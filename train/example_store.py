@@ -21,14 +21,14 @@ _WHOLE = "whole.json"
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class Room:
     """Where examples are kept."""
 
     memory: float = math.inf  # GB that they may take in memory
     folder: pathlib.Path | None = None  # where they are kept if they need more; None: in memory all the same
 
 
-IN_MEMORY = Place()
+IN_MEMORY = Room()
 """In memory, however large they are."""
 
 
@@ -41,7 +41,7 @@ class Kept:
         make_all: Callable[[], Any],
         count: int,
         *,
-        place: Place,
+        room: Room,
         about: str,
     ) -> None:
         """Prepare to keep examples; what is not said here, `ExampleStore` says.
@@ -50,10 +50,10 @@ class Kept:
           make: as of `ExampleStore`.
           make_all: function that returns all examples as `make` makes them, and shows how far it is.
           count: number of examples.
-          place: where to keep them.
+          room: where to keep them.
           about: as of `ExampleStore`.
         """
-        self._make, self._make_all, self._count, self._place, self._about = make, make_all, count, place, about
+        self._make, self._make_all, self._count, self._room, self._about = make, make_all, count, room, about
         self._all: Any = None
         self._store: ExampleStore | None = None
 
@@ -64,15 +64,15 @@ class Kept:
         return structs.take(self._all, index) if self._store is None else self._store.take(index)
 
     def _begin(self) -> None:
-        folder = self._place.folder
-        if folder is not None and self._size() > 1e9 * self._place.memory:
+        folder = self._room.folder
+        if folder is not None and self._size() > 1e9 * self._room.memory:
             self._store = ExampleStore(folder, self._make, self._count, about=self._about)
         else:
             self._all = self._make_all()
 
     def _size(self) -> float:
         """Return the bytes that all examples take; none where they fit whatever they are."""
-        if self._count * _LARGEST <= 1e9 * self._place.memory:
+        if self._count * _LARGEST <= 1e9 * self._room.memory:
             return 0.0
         some = jax.tree.leaves(self._make(_filled(np.zeros(1, int))))
         return self._count * sum(np.asarray(leaf).nbytes / len(leaf) for leaf in some)

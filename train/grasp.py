@@ -19,7 +19,7 @@ from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, Se
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
-from .example_store import IN_MEMORY, Kept, Place
+from .example_store import IN_MEMORY, Kept, Room
 from .split import Folders, load_sides
 
 PRETRAIN_VIEW = 192
@@ -188,13 +188,13 @@ class GraspTask:
 
     network = "grasp"
 
-    def __init__(self, data: Folders, config: grasp.GraspConfig, *, place: Place = IN_MEMORY) -> None:
+    def __init__(self, data: Folders, config: grasp.GraspConfig, *, room: Room = IN_MEMORY) -> None:
         """Load data sets.
 
         Args:
           data: folders of grasp episodes; the last tenth of each is held out.
           config: architecture.
-          place: where the windows of a `compact` network are kept.
+          room: where the windows of a `compact` network are kept.
 
         Raises:
           UserError: no folder; or one is damaged, or holds something else.
@@ -204,15 +204,15 @@ class GraspTask:
         self.size = self.examples = len(self.train_set.fault)
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
-        self._kept = self._keeper(self.train_set, place)
+        self._kept = self._keeper(self.train_set, room)
         self._held_out = self._keeper(self.test_set, IN_MEMORY)
 
-    def _keeper(self, episodes: GraspEpisode, place: Place) -> Kept:
+    def _keeper(self, episodes: GraspEpisode, room: Room) -> Kept:
         def make(index: np.ndarray) -> Window:
             return self.prepare(structs.take(episodes, index))
 
         count = len(episodes.fault)
-        return Kept(make, lambda: self._prepare_all(episodes), count, place=place, about=self.fingerprint)
+        return Kept(make, lambda: self._prepare_all(episodes), count, room=room, about=self.fingerprint)
 
     def prepare(self, episodes: GraspEpisode) -> Window:
         """Return windows `[B]` of episodes `[B]` as NumPy arrays."""

@@ -21,7 +21,7 @@ from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
-from .example_store import IN_MEMORY, Kept, Place
+from .example_store import IN_MEMORY, Kept, Room
 from .split import Folders, load_sides
 
 
@@ -48,7 +48,7 @@ class PushTask:
         centimetres: tuple[int, ...],
         without: tuple[str, ...] = (),
         found: bool = False,
-        place: Place = IN_MEMORY,
+        room: Room = IN_MEMORY,
     ) -> None:
         """Load data sets.
 
@@ -59,7 +59,7 @@ class PushTask:
           centimetres: distances learnt, each 1 to 10.
           without: leave out scenes with an object of these classes (`shapes.CLASSES`).
           found: masks are found in the image by `segment`, not taken from the simulator.
-          place: where the examples of a `compact` network are kept.
+          room: where the examples of a `compact` network are kept.
         """
         if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
             raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
@@ -82,7 +82,7 @@ class PushTask:
         self.found = found
         self.slots = sides.slots
         self._kept = Kept(
-            self._some, lambda: self._prepare_all(self.train_set), count, place=place, about=self.fingerprint
+            self._some, lambda: self._prepare_all(self.train_set), count, room=room, about=self.fingerprint
         )
         self._held_out: Example | None = None
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from dipn_jax.train import cli
-from dipn_jax.train.example_store import ExampleStore, Kept, Place
+from dipn_jax.train.example_store import ExampleStore, Kept, Room
 from dipn_jax.train.grasp import GraspTask
 from dipn_jax.train.push import PushTask
 
@@ -73,7 +73,7 @@ def test_what_was_closed_is_taken_up_and_nothing_else(
 def test_examples_are_in_files_only_if_they_are_large(memory: float, tmp_path: pathlib.Path) -> None:
     maker = Maker()
     everything = lambda: maker(np.resize(np.arange(5000), 5008))  # noqa: E731
-    kept = Kept(maker, everything, 5000, place=Place(memory, tmp_path / "s"), about="squares")
+    kept = Kept(maker, everything, 5000, room=Room(memory, tmp_path / "s"), about="squares")
     np.testing.assert_array_equal(kept.take(np.array([4, 4000]))["square"], [16, 16_000_000])
     kept.close()
     assert (tmp_path / "s").exists() == (memory < 0.001) and (len(set(maker.made)) == 5000) == (memory > 0.001)
@@ -82,12 +82,12 @@ def test_examples_are_in_files_only_if_they_are_large(memory: float, tmp_path: p
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["push", "grasp"])
 def test_tasks_learn_from_the_same_examples(kind: str, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
-    def task(**place: Any) -> Any:
+    def task(**room: Any) -> Any:
         if kind == "push":
-            return PushTask(data["push"], DipnConfig(width=8), limit=None, centimetres=(5, 10), **place)
-        return GraspTask(data["grasp"], GraspConfig(width=8), **place)
+            return PushTask(data["push"], DipnConfig(width=8), limit=None, centimetres=(5, 10), **room)
+        return GraspTask(data["grasp"], GraspConfig(width=8), **room)
 
-    large = task(place=Place(0, tmp_path / "s"))
+    large = task(room=Room(0, tmp_path / "s"))
     index = np.array([3, 0, 17, 3])
     stored, kept = large.fetch(index), task().fetch(index)
     large.close()
