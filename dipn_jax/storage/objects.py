@@ -7,6 +7,7 @@ import dataclasses
 import datetime
 import importlib.util
 import pathlib
+import re
 import urllib.parse
 from collections.abc import Iterator
 from typing import Any
@@ -25,6 +26,8 @@ NO_CREDENTIALS = ("/latest/api/token", "/latest/meta-data", "computeMetadata", "
 FIRST_RETRIES = {"max_retries": 1, "retry_timeout": datetime.timedelta(seconds=20)}
 """How often the first request is tried again: a mistake of the user's is said soon; later ones have obstore's patience.
 """
+NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")
+"""Parts of the answers where there is no bucket."""
 MOST_SAID = 200
 """Characters of a reason that are shown at most."""
 
@@ -115,18 +118,20 @@ class Bucket:
 
         try:
             yield
-        except (obstore.exceptions.BaseError, FileNotFoundError) as error:
+        except (obstore.exceptions.BaseError, OSError) as error:
             raise UserError(f"{self.url}: {self._why(error)}") from None
 
     def _why(self, error: Exception) -> str:
         """Return what is wrong, and what to do."""
-        first = str(error).strip().split("\n")[0]
+        text = str(error)
+        answer = re.search("<Message>([^<]+)", text)
+        first = answer[1] if answer else text.strip().split("\n")[0]
         if self.scheme == "file":
             return f"cannot be used ({typed.one_line(first, most=MOST_SAID)}); give another folder"
-        if isinstance(error, FileNotFoundError):
+        if isinstance(error, FileNotFoundError) or any(part in text for part in NO_BUCKET):
             return "no such bucket; make it, or give another"
         needs = f"the environment has to say {SETTINGS[self.scheme]}"
-        if any(part in str(error) for part in NO_CREDENTIALS):
+        if any(part in text for part in NO_CREDENTIALS):
             return f"no credentials; {needs}"
         return f"cannot be used ({typed.one_line(first, most=MOST_SAID)}); {needs}"
 

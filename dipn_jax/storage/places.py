@@ -120,12 +120,11 @@ class Objects:
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
         """As `Place.counts`: shards that the manifest does not list are fetched to be looked at."""
-        there, listed = self._bucket.list(), self._listed()
+        there = self._bucket.list()
+        known = self._listed() | self._entries
         names = {index: _name(index) for index in indices if _name(index) in there}
-        self._entries |= {
-            name: listed[name]
-            for name in names.values()
-            if name in listed and listed[name]["bytes"] == there[name].size
+        self._entries = {
+            name: known[name] for name in names.values() if name in known and known[name]["bytes"] == there[name].size
         }
         todo = [name for name in names.values() if name not in self._entries]
         with (
