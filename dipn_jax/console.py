@@ -173,7 +173,7 @@ def _with_paths(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def called(*positional: Any, **named: Any) -> Any:
-        hints = typing.get_type_hints(command, include_extras=True)
+        hints = typing.get_type_hints(inspect.unwrap(command), include_extras=True)
         options = inspect.signature(command).bind(*positional, **named).arguments
         for name, value in options.items():
             options[name] = files.with_absolute_paths(value, urls=addresses.taken(hints.get(name)))
