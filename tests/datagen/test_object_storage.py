@@ -74,9 +74,12 @@ def test_tasks_make_it(alone: pathlib.Path, tmp_path: pathlib.Path, monkeypatch:
             assert function(*task) == function(*task)
             yield number, function(*task)
 
+    create, tried = Bucket.create, list[str]()
     monkeypatch.setattr(launch, "run", run)
+    monkeypatch.setattr(Bucket, "create", lambda self, name, data: (tried.append(name), create(self, name, data))[1])
     assert console.run("test", cli.COMMANDS, [*WORDS, "--out", f"file://{tmp_path}/there", "--launcher", "ray"]) == 0
     assert _bytes(tmp_path / "there") == _bytes(alone)
+    assert sorted(tried) == ["config.json", *(f"shard-{index:05d}.parquet" for index in range(6))], "made once"
 
 
 def test_the_commands_read_it(

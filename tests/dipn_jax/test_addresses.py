@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 
-from dipn_jax import addresses, console
+from dipn_jax import addresses, console, launch
 from dipn_jax.addresses import Place
+from dipn_jax.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -49,3 +50,15 @@ def test_lines_name_a_copy_by_its_url(capsys: pytest.CaptureFixture[str], tmp_pa
     output = capsys.readouterr()
     assert output.out == "s3://bucket/data/x: whole\n"
     assert output.err == "warning: run `dipn-datagen repair s3://bucket/data`\n"
+
+
+def test_a_task_says_the_url_of_its_copy(tmp_path: pathlib.Path) -> None:
+    """It has names of its own, which the command that gets its line does not know."""
+    addresses.call(tmp_path, "s3://bucket/data")
+
+    def failing(error: Exception) -> None:
+        raise error
+
+    assert launch._attempt(failing, (UserError(f"{tmp_path}: begun"),)) == (None, "s3://bucket/data: begun")
+    result, said = launch._attempt(failing, (OSError(28, "No space left", str(tmp_path)),))
+    assert result is None and str(said).startswith("s3://bucket/data: No space left")

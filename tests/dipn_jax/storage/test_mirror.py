@@ -57,9 +57,11 @@ def test_what_changes_there_changes_in_the_copy(there: pathlib.Path, fetched: li
     assert fetched == ["manifest.json"] and "shard-00001.parquet" not in _contents(copy)
     episodes = shards.read_shard(shards.shard_path(there, 0), kind="push")
     shards.write_shard(there, 0, episodes, kind="push", config={"seed": 8}, faults={})
-    shards.shard_path(copy, 0).write_bytes(b"torn")
     mirror.local(url)
     assert fetched[1:] == ["shard-00000.parquet"]
+    shards.shard_path(copy, 0).write_bytes(b"torn")
+    mirror.local(url)
+    assert fetched[2:] == ["shard-00000.parquet"]
     fetched.clear()
     (copy / mirror.INDEX).write_bytes(b"{")
     mirror.local(url)

@@ -50,6 +50,7 @@ def test_a_shard_of_fewer_episodes_is_replaced(place: Place, there: pathlib.Path
     place.forget([1, 2])
     assert list(manifest.listed(there)) == ["shard-00000.parquet"]
     made = {f"shard-0000{index}.parquet": place.commit(index, _write(place, there, index)) for index in (1, 2)}
+    assert list(place.folder.glob("shard-*")) == [], "a job of many shards fills no disk"
     assert place.list(made)["episodes"] == 48 and records.verify(there) == []
     assert list(manifest.listed(there)) == [f"shard-0000{index}.parquet" for index in range(3)]
 
