@@ -114,14 +114,15 @@ def test_a_training_reads_it(data: dict[str, pathlib.Path], tmp_path: pathlib.Pa
 def test_what_cannot_be_there_is_refused_in_one_line(
     tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for words in (
-        ["merge", "s3://b/x"],
-        ["merge", "a", "b", "--out", "s3://b/x"],
-        ["export", "data", "--out", "gs://b/x"],
-        ["info", f"file://{tmp_path}/gone"],
+    gone = f"file://{tmp_path}/gone"
+    for words, said in (
+        (["merge", gone], f"merge {gone}: shards need not be listed there; dipn-datagen verify {gone} checks them"),
+        (["merge", "a", "b", "--out", "s3://b/x"], "s3://b/x: a URL, which this option does not take; give a path"),
+        (["export", "data", "--out", "gs://b/x"], "gs://b/x: a URL, which this option does not take; give a path"),
+        (["info", gone], f"data set {gone}: no such folder; give one that dipn-datagen wrote"),
     ):
         assert console.run("test", cli.COMMANDS, words) == 2
-        assert capsys.readouterr().err.count("\n") == 1
+        assert capsys.readouterr().err == f"error: {said}\n"
 
 
 KILLED = """
