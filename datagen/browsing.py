@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dipn_jax import console, files, pages, structs, typed
+from dipn_jax import addresses, console, files, pages, structs, typed
 from dipn_jax.sight import render
 from dipn_jax.storage import accounting, records, shards
 from dipn_jax.structs import ABSENT, Fault
@@ -157,7 +157,7 @@ def _page(folder: pathlib.Path, about: dict[str, Any], counts: Counts, figures: 
     ]
     tables = "".join(pages.bars(name, dict(sorted(some.items()))) for name, some in counts.items())
     parts = [
-        f"<h1>{pages.escaped(title)}</h1><p>{pages.escaped(str(folder))}</p>",
+        f"<h1>{pages.escaped(title)}</h1><p>{pages.escaped(addresses.named(str(folder)))}</p>",
         *[f'<p class="note">{pages.escaped(said)}</p>' for said in _remarks(about)],
         f"<h2>Counts</h2>{pages.table(['', ''], facts)}<h2>What was drawn</h2>{tables}",
         f"<h2>Episodes</h2><p>{_selects(counts)}<span id=shown>{len(figures)}</span> of {len(figures)} shown, drawn at "

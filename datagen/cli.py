@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from dipn_jax import command_words, console
+from dipn_jax.addresses import Place
 from dipn_jax.errors import UserError
 from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import EngineName
@@ -79,7 +80,7 @@ def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *,
 
 
 def push(
-    out: pathlib.Path,
+    out: Place,
     episodes: int = 1500,
     objects: Objects = "paper",
     seed: int = 0,
@@ -101,7 +102,7 @@ def push(
       dipn-datagen push --out data/million --episodes 1000000 --launcher ray --num-cpus 4
 
     Args:
-      out: folder of the data set; the same command continues, more --episodes extend it.
+      out: folder of the data set, or a URL (s3, gs, az, file); the same command continues, more --episodes extend it.
       episodes: number of episodes.
       objects: number of objects in a scene.
       seed: random seed of everything.
@@ -131,7 +132,7 @@ def push(
 
 
 def grasp(
-    out: pathlib.Path,
+    out: Place,
     episodes: int = 3000,
     objects: Objects = "10",
     seed: int = 0,
@@ -152,7 +153,7 @@ def grasp(
       dipn-datagen grasp --grasp-net runs/gn-pretrained --out data/guided --episodes 12000
 
     Args:
-      out: folder of the data set; the same command continues, more --episodes extend it.
+      out: folder of the data set, or a URL (s3, gs, az, file); the same command continues, more --episodes extend it.
       episodes: number of episodes.
       objects: number of objects in a scene.
       seed: random seed of everything.
@@ -203,7 +204,7 @@ def _generate_guided(
 
 
 def images(
-    out: pathlib.Path,
+    out: Place,
     episodes: int = 100,
     objects: Objects = "10",
     seed: int = 0,
@@ -216,7 +217,7 @@ def images(
       dipn-datagen images --out data/images --episodes 100
 
     Args:
-      out: folder of the data set; the same command continues, more --episodes extend it.
+      out: folder of the data set, or a URL (s3, gs, az, file); the same command continues, more --episodes extend it.
       episodes: number of scenes.
       objects: number of objects in a scene.
       seed: random seed of everything.

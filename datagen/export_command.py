@@ -7,6 +7,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from dipn_jax import addresses
+from dipn_jax.addresses import Place
+
 Format = Literal["parquet", "npz", "hdf5", "zarr", "lerobot"]
 """Format of an export."""
 Images = Literal["none", "before", "after", "both", "all"]
@@ -14,7 +17,7 @@ Images = Literal["none", "before", "after", "both", "all"]
 
 
 def export(
-    data: tyro.conf.Positional[pathlib.Path],
+    data: tyro.conf.Positional[Place],
     out: pathlib.Path,
     format_: Annotated[Format, tyro.conf.arg(name="format")] = "parquet",
     images: Images = "none",
@@ -31,14 +34,17 @@ def export(
     stopped.
 
     Args:
-      data: a data set of pushes, grasps or images.
+      data: a data set of pushes, grasps or images, or its URL.
       out: folder of the export.
       format_: parquet and npz: all numbers of an episode; hdf5 (as robomimic), zarr (as replay buffers) and lerobot
         (pushes): steps.
       images: height, colour and labels, rendered before or after the action, both, or at all eleven recorded moments
         of a push; a format of steps has all (pushes) or before.
     """
+    from dipn_jax.storage import mirror
+
     from .exporting.export import export as write
 
-    command = ["dipn-datagen", "export", str(data), "--out", str(out), "--format", format_, "--images", images]
-    write(data, out, form=format_, images=images, command=command)
+    given = addresses.url(data) or str(data)
+    command = ["dipn-datagen", "export", given, "--out", str(out), "--format", format_, "--images", images]
+    write(mirror.local(data), out, form=format_, images=images, command=command)

@@ -24,7 +24,8 @@ from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine, resolve
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
-from dipn_jax.storage import accounting, manifest, shards
+from dipn_jax.storage import accounting, places, shards
+from dipn_jax.storage.places import Place
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 
@@ -162,7 +163,7 @@ def generate(
 
     Args:
       job: everything that determines the data set.
-      out: its folder.
+      out: its folder, or its URL.
       part: number of this worker.
       of: number of workers.
       threads: that `native` simulates on; shards are then made one at a time, so that no more are used.
@@ -171,36 +172,37 @@ def generate(
       elsewhere: makes the shards on other machines; all are made here if not given.
 
     Raises:
-      UserError: the folder holds a data set of another config.
+      UserError: the folder holds a data set of another config, or cannot be written to.
     """
     console.require_positive(of=of)
-    console.require_out(out)
     if not 0 <= part < of:
         raise UserError(f"--shard {part} --of {of}: want 0 <= shard < of")
     job = dataclasses.replace(job, engine=resolve(job.engine))
-    engine = make_engine(job.engine, timestep=job.timestep, threads=threads)
-    _claim(job, out)
-    if command is not None:
-        accounting.note(out, command, of=of)
-    mine = range(part, job.shards(), of)
-    todo = [index for index in mine if not written(out, index, job)]
-    total = sum(map(job.size, mine))
-    manifest.forget(out, {shards.shard_path(out, index).name for index in todo})
-    made: dict[str, Any] = {}
-    try:
-        with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
-            tally = _Tally(progress)
-            if elsewhere is None:
-                at_once = 1 if threads else SHARDS_AT_ONCE
-                _write_all(job, todo, out, engine, tally, scorer, made, at_once=at_once)
-            else:
-                _gather(elsewhere(job, todo, out), tally, made)
-    except BaseException:
-        with contextlib.suppress(UserError, OSError):  # what ended the work is said
-            manifest.update_manifest(out, made=made)
-        raise
-    listed = manifest.update_manifest(out, made=made)
-    console.say(f"{out}: {listed['episodes']} {job.kind} episodes in {len(listed['shards'])} shards")
+    with places.opened(out) as place:
+        engine = make_engine(job.engine, timestep=job.timestep, threads=threads)
+        place.claim(functools.partial(_claim, job))
+        if command is not None:
+            place.note(command, of=of)
+        mine = range(part, job.shards(), of)
+        held = place.counts(mine)
+        todo = [index for index in mine if held.get(index) != job.size(index)]
+        total = sum(map(job.size, mine))
+        place.forget(todo)
+        made: dict[str, Any] = {}
+        try:
+            with console.Progress(job.kind, total, unit="episodes", done=total - sum(map(job.size, todo))) as progress:
+                tally = _Tally(progress)
+                if elsewhere is None:
+                    at_once = 1 if threads else SHARDS_AT_ONCE
+                    _write_all(job, todo, place, engine, tally, scorer, made, at_once=at_once)
+                else:
+                    _gather(elsewhere(job, todo, out), tally, made)
+        except BaseException:
+            with contextlib.suppress(UserError, OSError):  # what ended the work is said
+                place.list(made)
+            raise
+        listed = place.list(made)
+    console.say(f"{place.name}: {listed['episodes']} {job.kind} episodes in {len(listed['shards'])} shards")
 
 
 def _gather(finished: Generator[tuple[str, dict[str, Any]], None, None], tally: _Tally, made: dict[str, Any]) -> None:
@@ -214,7 +216,7 @@ def _gather(finished: Generator[tuple[str, dict[str, Any]], None, None], tally: 
 def _write_all(
     job: Job,
     todo: list[int],
-    out: pathlib.Path,
+    place: Place,
     engine: Engine,
     tally: _Tally,
     scorer: Scorer | None,
@@ -228,7 +230,7 @@ def _write_all(
     """
 
     def one(index: int) -> None:
-        name, entry = write_one(job, index, out, engine, tally, scorer)
+        name, entry = write_one(job, index, place, engine, tally, scorer)
         made[name] = entry
 
     with concurrent.futures.ThreadPoolExecutor(at_once) as pool:
@@ -245,20 +247,14 @@ def _write_all(
 
 
 def write_one(
-    job: Job, index: int, out: pathlib.Path, engine: Engine, tally: _Tally | None, scorer: Scorer | None
+    job: Job, index: int, place: Place, engine: Engine, tally: _Tally | None, scorer: Scorer | None
 ) -> tuple[str, dict[str, Any]]:
     """Make and write one shard; return its name and its entry in the manifest."""
     # the content of a shard does not depend on how many others there are
     config = {key: value for key, value in job.describe().items() if key != "episodes"}
     episodes, counts = shard(job, index, engine, tally, scorer)
-    entry = shards.write_shard(out, index, episodes, kind=job.kind, config=config, faults=counts)
-    return shards.shard_path(out, index).name, entry
-
-
-def written(out: pathlib.Path, index: int, job: Job) -> bool:
-    """Return whether shard `index` is there with all its episodes; a shorter one is made anew."""
-    path = shards.shard_path(out, index)
-    return path.exists() and shards.count(path) == job.size(index)
+    entry = shards.write_shard(place.folder, index, episodes, kind=job.kind, config=config, faults=counts)
+    return shards.shard_path(place.folder, index).name, place.commit(index, entry)
 
 
 def _claim(job: Job, out: pathlib.Path) -> None:

@@ -6,11 +6,12 @@ import pathlib
 
 import tyro
 
-from dipn_jax import console
+from dipn_jax import addresses, console
+from dipn_jax.addresses import Place
 from dipn_jax.errors import UserError
 
 
-def merge(folders: tyro.conf.Positional[tuple[pathlib.Path, ...]], out: pathlib.Path | None = None) -> None:
+def merge(folders: tyro.conf.Positional[tuple[Place, ...]], out: pathlib.Path | None = None) -> None:
     """Join data sets of one kind: shards that workers made on several disks, or sets that were made apart.
 
     Shards are copied as they are. Those of one configuration keep their numbers, and what is still missing of the
@@ -21,16 +22,20 @@ def merge(folders: tyro.conf.Positional[tuple[pathlib.Path, ...]], out: pathlib.
       dipn-datagen merge data/push
 
     Args:
-      folders: two data sets or more; or one, in which shards are to be listed.
+      folders: two data sets or more, or their URLs; or one folder, in which shards are to be listed.
       out: folder of the joined data set; the same command continues where it stopped.
     """
     if not folders or (out is None) != (len(folders) == 1):
         raise UserError(f"merge: {len(folders)} folders {'without' if out is None else 'with'} --out; want two or more "
                         "with --out, or one without, in which copied shards are to be listed")  # fmt: skip
+    from dipn_jax.storage import mirror
+
     from . import merging
 
-    if out is None:
-        merging.gather(folders[0])
-    else:
+    if out is not None:
         console.require_out(out)
-        merging.merge(folders, out)
+        merging.merge([mirror.local(folder) for folder in folders], out)
+    elif address := addresses.url(folders[0]):
+        raise UserError(f"merge {address}: shards need not be listed there; dipn-datagen verify {address} checks them")
+    else:
+        merging.gather(folders[0])

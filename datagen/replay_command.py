@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import pathlib
 from typing import Annotated
 
 import tyro
 
 from dipn_jax import console
+from dipn_jax.addresses import Place
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
 
 
 def replay(
-    folder: tyro.conf.Positional[pathlib.Path],
+    folder: tyro.conf.Positional[Place],
     ids: tyro.conf.Positional[tuple[str, ...]] = (),
     all_: Annotated[bool, tyro.conf.arg(name="all"), tyro.conf.FlagCreatePairsOff] = False,
     sample: int | None = None,
@@ -33,7 +33,7 @@ def replay(
       dipn-datagen replay data/push --sample 50 --engine mjx --tolerance 0.002
 
     Args:
-      folder: a data set of pushes or grasps.
+      folder: a data set of pushes or grasps, or its URL.
       ids: numbers of episodes from 0, in the order of `read_episodes`; 5:8 is 5, 6, 7.
       all_: every episode.
       sample: this many episodes, drawn at random.
@@ -51,8 +51,10 @@ def replay(
     if tolerance is not None:
         console.require_between(0, 10, tolerance=tolerance)
     console.require_seed(seed)
+    from dipn_jax.storage import mirror
+
     from . import replay as replaying
 
-    data = replaying.open_set(folder)
+    data = replaying.open_set(mirror.local(folder))
     chosen = data.draw(sample, seed) if sample is not None else data.everything() if all_ else data.chosen(ids)
     return replaying.report(data, chosen, data.engine(engine, timestep, threads), tolerance)

@@ -15,7 +15,7 @@ from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import scorers
 from dipn_jax.planning.planner import Scorer
-from dipn_jax.storage import checkpoint, shards
+from dipn_jax.storage import checkpoint, places, shards
 
 from . import generate
 from .generate import Elsewhere, Job
@@ -47,7 +47,7 @@ def make_shard(
       job: everything that determines the data set.
       described: the job as the folder was begun with.
       index: the shard's number.
-      out: folder of the data set, which all machines share.
+      out: folder of the data set, which all machines share, or its URL.
       threads: that native simulates on.
       network: run with the network of `job.weights`.
 
@@ -56,13 +56,13 @@ def make_shard(
     """
     if job.describe() != described:
         raise UserError(f"{out}: begun with {described.get('device')}, a task has {job.describe().get('device')}")
-    if not (out / "config.json").exists():
-        raise UserError(f"{out}: a task does not see it; give an --out that all machines of the cluster share")
-    if generate.written(out, index, job):  # before the worker was lost
-        path = shards.shard_path(out, index)
-        return path.name, shards.entry(path)
-    scorer = _scorer(network, job.weights) if network else None
-    return generate.write_one(job, index, out, _engine(job.engine, job.timestep, threads), None, scorer)
+    with places.opened(out) as place:
+        if not place.begun():
+            raise UserError(f"{out}: a task does not see it; give an --out that all machines of the cluster share")
+        if place.counts([index]).get(index) == job.size(index):  # before the worker was lost
+            return shards.shard_path(out, index).name, place.entry(index)
+        scorer = _scorer(network, job.weights) if network else None
+        return generate.write_one(job, index, place, _engine(job.engine, job.timestep, threads), None, scorer)
 
 
 @functools.cache

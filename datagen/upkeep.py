@@ -7,24 +7,26 @@ import pathlib
 
 import tyro
 
-from dipn_jax import console
+from dipn_jax import addresses, console
+from dipn_jax.addresses import Place
 from dipn_jax.errors import UserError
 
 MOST_SHOWN = 2000
 """Episodes on a page at most: about 10 MB."""
 
 
-def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
+def verify(folder: tyro.conf.Positional[Place]) -> None:
     """Check every shard, and that all episodes that were asked for are there; exit 2 if something is wrong.
 
     Sizes, SHA-256 and columns of the shards are held against the manifest; a shard that no worker has made is named,
     with the command that makes it.
 
     Args:
-      folder: a data set.
+      folder: a data set, or its URL.
     """
-    from dipn_jax.storage import records
+    from dipn_jax.storage import mirror, records
 
+    folder = mirror.local(folder)
     problems = records.verify(folder)
     if problems:
         path, what = problems[0]
@@ -37,21 +39,23 @@ def verify(folder: tyro.conf.Positional[pathlib.Path]) -> None:
     console.say(f"{folder}: all shards are whole")
 
 
-def repair(folder: tyro.conf.Positional[pathlib.Path]) -> None:
+def repair(folder: tyro.conf.Positional[Place]) -> None:
     """Set damaged shards aside and rebuild the manifest; the command that made the data set then fills the gaps.
 
     Args:
-      folder: a data set.
+      folder: a data set, or its URL.
     """
-    from dipn_jax.storage import records
+    from dipn_jax.storage import mirror, places, records
 
-    removed = records.repair(folder)
+    address = addresses.url(folder)
+    removed = places.repair(address) if address else records.repair(folder)
+    folder = mirror.local(folder)
     console.say(f"{folder}: {len(removed)} damaged shards set aside {[p.name for p in removed]}")
     console.say(records.missing(folder) or f"{folder}: nothing is missing")
 
 
 def info(
-    folder: tyro.conf.Positional[pathlib.Path],
+    folder: tyro.conf.Positional[Place],
     html: pathlib.Path | None = None,
     sample: int = 100,
     seed: int = 0,
@@ -65,15 +69,16 @@ def info(
       dipn-datagen info data/push --html push.html --sample 200
 
     Args:
-      folder: a data set.
+      folder: a data set, or its URL.
       html: file of the page, which needs no other.
       sample: episodes on the page, drawn at random.
       seed: of that draw.
     """
-    from dipn_jax.storage import accounting, records
+    from dipn_jax.storage import accounting, mirror, records
 
     console.require_between(1, MOST_SHOWN, sample=sample)
     console.require_seed(seed)
+    folder = mirror.local(folder)
     summary = records.summary(folder)
     if html is not None:
         from . import browsing

@@ -17,13 +17,14 @@ import signal
 import sys
 import threading
 import time
+import typing
 from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from dipn_jax import files
+from dipn_jax import addresses, files
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import stops
 
@@ -42,10 +43,10 @@ def enable_compilation_cache() -> None:
     # on some processors XLA logs an error for every program that it finds in the cache, though it runs them (openxla
     # issue 44565); it reads this variable when JAX is first imported
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    if home.startswith("~"):  # a user without a home folder, as in some containers: nothing is kept
+    home = files.cache()
+    if home is None:  # as in some containers: nothing is kept
         return
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(pathlib.Path(home) / "dipn-jax" / "xla")
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(home / "xla")
     settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.5}
     for name, value in settings.items():
         if "jax" in sys.modules:
@@ -127,12 +128,12 @@ def _use_utf8() -> None:
 
 def say(text: str) -> None:
     """Print one line for the user on standard output."""
-    print(text, flush=True)
+    print(addresses.named(text), flush=True)
 
 
 def warn(text: str) -> None:
     """One line for the user, on standard error, about what goes on in spite of it."""
-    print(f"warning: {text}", file=sys.stderr, flush=True)
+    print(f"warning: {addresses.named(text)}", file=sys.stderr, flush=True)
 
 
 def require_positive(**values: float) -> None:
@@ -172,8 +173,11 @@ def _with_paths(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def called(*positional: Any, **named: Any) -> Any:
-        options = {name: files.with_absolute_paths(value) for name, value in named.items()}
-        return command(*files.with_absolute_paths(positional), **options)
+        hints = typing.get_type_hints(inspect.unwrap(command), include_extras=True)
+        options = inspect.signature(command).bind(*positional, **named).arguments
+        for name, value in options.items():
+            options[name] = files.with_absolute_paths(value, urls=addresses.taken(hints.get(name)))
+        return command(**options)
 
     return called
 
@@ -229,10 +233,10 @@ def exit_code(work: Callable[[], int | None]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {addresses.named(str(error))}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"error: {mended(error)}", file=sys.stderr)
+        print(f"error: {addresses.named(mended(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted: run the same command again to continue from here", file=sys.stderr)

@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from dipn_jax import typed
+from dipn_jax import addresses, typed
 from dipn_jax.errors import UserError
 
 
@@ -51,24 +51,40 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
     """Return a path that a user gave with `~` expanded, and absolute; links in it stay.
 
     Raises:
-      UserError: there is no such home folder.
+      UserError: there is no such home folder, or it is a URL.
     """
+    if address := addresses.url(path):
+        raise UserError(f"{address}: a URL, which this option does not take; give a path")
     try:
         return pathlib.Path(path).expanduser().absolute()
     except RuntimeError:
         raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
 
 
-def with_absolute_paths(value: Any) -> Any:
-    """Return a parsed option with every path in it expanded and absolute; the name `builtin` is no path."""
+def with_absolute_paths(value: Any, *, urls: bool = False) -> Any:
+    """Return a parsed option with every path in it expanded and absolute; the name `builtin` is no path.
+
+    Args:
+      value: the option.
+      urls: whether it may be a URL, which stays as it is.
+
+    Raises:
+      UserError: as `absolute`.
+    """
     if isinstance(value, pathlib.Path):
-        return value if str(value) == "builtin" else absolute(value)
+        return value if str(value) == "builtin" or (urls and addresses.url(value)) else absolute(value)
     if isinstance(value, tuple):
-        return tuple(map(with_absolute_paths, value))
+        return tuple(with_absolute_paths(each, urls=urls) for each in value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
         return dataclasses.replace(value, **{name: with_absolute_paths(each) for name, each in fields.items()})
     return value
+
+
+def cache() -> pathlib.Path | None:
+    """Return our folder in the user's cache (`XDG_CACHE_HOME`, else `~/.cache`); None for a user without a home."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return None if home.startswith("~") else pathlib.Path(home) / "dipn-jax"
 
 
 def file_sha256(path: pathlib.Path) -> str:

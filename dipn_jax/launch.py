@@ -13,7 +13,7 @@ import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, Literal
 
-from dipn_jax import console, machine
+from dipn_jax import addresses, console, machine
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import STOPS
 
@@ -94,9 +94,9 @@ def _attempt(function: Callable[..., Any], task: tuple[Any, ...]) -> tuple[Any, 
     try:
         return function(*task), None
     except UserError as error:
-        return None, str(error)
+        return None, addresses.named(str(error))
     except OSError as error:
-        return None, console.mended(error)
+        return None, addresses.named(console.mended(error))
 
 
 def _window(ray: Any, launch: Launch) -> int:

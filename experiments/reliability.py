@@ -146,6 +146,16 @@ PROMISES = (
         ),
     ),
     Promise(
+        "In object storage several workers make each shard once, and one that is killed leaves whole shards only; the "
+        "next completes them to the data set of one machine, byte for byte.",
+        (
+            "tests/datagen/test_object_storage.py::"
+            "test_racing_writers_make_each_shard_once_and_a_killed_ones_work_goes_on",
+            f"{_STORAGE}/test_objects.py::test_of_racing_writers_one_wins",
+            f"{_STORAGE}/test_places.py::test_a_shard_that_another_has_made_stays_and_is_listed_as_it_is",
+        ),
+    ),
+    Promise(
         "A training that devices or processes share learns what one device learns, but for rounding; an interruption "
         "of one process ends all with a checkpoint, from which any number of devices goes on.",
         ("tests/train/test_devices.py::test_four_devices_learn_what_one_does_and_one_goes_on_from_there",),

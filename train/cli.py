@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from dipn_jax import console
+from dipn_jax.addresses import Place
 
 from .acting_commands import baseline, grasp_online, say
 from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig
@@ -59,6 +60,13 @@ def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
         yield Room(compute.memory, out / "examples" / str(compute.process))
 
 
+def _local(data: tuple[pathlib.Path, ...]) -> tuple[pathlib.Path, ...]:
+    """Return the folders of data sets: those given, and copies of what is at URLs."""
+    from dipn_jax.storage import mirror
+
+    return tuple(map(mirror.local, data))
+
+
 def _initial(init: pathlib.Path | None, network: str) -> Any:
     """The network to start from, if one is given."""
     from dipn_jax.storage import checkpoint
@@ -67,7 +75,7 @@ def _initial(init: pathlib.Path | None, network: str) -> Any:
 
 
 def push(
-    data: tuple[pathlib.Path, ...],
+    data: tuple[Place, ...],
     out: pathlib.Path,
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
@@ -88,7 +96,7 @@ def push(
         --batch 8 --weight-decay 2e-4 --limit 1500 --steps 9375 --centimetres 5
 
     Args:
-      data: folders of push episodes; of each the last tenth is held out.
+      data: folders, or URLs, of push episodes; of each the last tenth is held out.
       out: run folder; the same command continues where it stopped.
       init: run to start from, or builtin; its architecture is used.
       preset: architecture, without --init.
@@ -107,13 +115,15 @@ def push(
     found, initial = masks == "found", _initial(init, "dipn")
     network = initial.config if initial else DipnConfig(preset=preset)
     with _room(out, compute) as room:
-        task = PushTask(data, network, limit=limit, centimetres=centimetres, without=without, found=found, room=room)
+        task = PushTask(
+            _local(data), network, limit=limit, centimetres=centimetres, without=without, found=found, room=room
+        )
         with contextlib.closing(task):
             _fit(task, config, out, compute, initial=initial)
 
 
 def grasp_pretrain(
-    data: tuple[pathlib.Path, ...],
+    data: tuple[Place, ...],
     out: pathlib.Path,
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
@@ -126,7 +136,7 @@ def grasp_pretrain(
       dipn-train grasp-pretrain --data data/images --out runs/gn-pretrained
 
     Args:
-      data: folders of settled scenes (dipn-datagen images).
+      data: folders, or URLs, of settled scenes (dipn-datagen images).
       out: run folder; the same command continues where it stopped.
       init: run to start from, or builtin; its architecture is used.
       preset: architecture, without --init.
@@ -140,11 +150,11 @@ def grasp_pretrain(
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    _fit(PretrainTask(data, network), config, out, compute, initial=initial)
+    _fit(PretrainTask(_local(data), network), config, out, compute, initial=initial)
 
 
 def grasp(
-    data: tuple[pathlib.Path, ...],
+    data: tuple[Place, ...],
     out: pathlib.Path,
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
@@ -157,7 +167,7 @@ def grasp(
       dipn-train grasp --data data/grasp --init runs/gn-pretrained --out runs/gn
 
     Args:
-      data: folders of grasp episodes.
+      data: folders, or URLs, of grasp episodes.
       out: run folder; the same command continues where it stopped.
       init: run to start from (grasp-pretrain's), or builtin; its architecture is used.
       preset: architecture, without --init.
@@ -171,7 +181,7 @@ def grasp(
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    with _room(out, compute) as room, contextlib.closing(GraspTask(data, network, room=room)) as task:
+    with _room(out, compute) as room, contextlib.closing(GraspTask(_local(data), network, room=room)) as task:
         _fit(task, config, out, compute, initial=initial)
 
 

@@ -63,7 +63,7 @@ def forget(folder: pathlib.Path, names: Collection[str]) -> None:
     with _turn(folder):
         known = _read(folder)["shards"]
         if not known.keys().isdisjoint(names):
-            _write(folder, {name: entry for name, entry in known.items() if name not in names})
+            write(folder, {name: entry for name, entry in known.items() if name not in names})
 
 
 @contextlib.contextmanager
@@ -95,10 +95,10 @@ def _rebuild(folder: pathlib.Path, made: Mapping[str, Any]) -> dict[str, Any]:
         if entry is None or entry["bytes"] != path.stat().st_size:
             entry = shards.entry(path)
         entries[path.name] = entry
-    return _write(folder, entries)
+    return write(folder, entries)
 
 
-def _write(folder: pathlib.Path, entries: dict[str, Any]) -> dict[str, Any]:
+def write(folder: pathlib.Path, entries: dict[str, Any]) -> dict[str, Any]:
     """Write a manifest that lists these shards, and return it."""
     manifest = {
         "schema_version": shards.SCHEMA_VERSION,

@@ -12,7 +12,7 @@ import numpy as np
 
 from dipn_jax import console, files
 from dipn_jax.errors import UserError
-from dipn_jax.storage import accounting, manifest, shards
+from dipn_jax.storage import accounting, manifest, mirror, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 
@@ -135,12 +135,12 @@ def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | Se
       observation = dipn_jax.render(pushes.scene[0], pushes.poses[0, 0])
 
     Args:
-      folder: what `dipn-datagen push`, `grasp` or `images` wrote.
+      folder: what `dipn-datagen push`, `grasp` or `images` wrote, or its URL.
 
     Raises:
       UserError: there is no data set, or a shard of it is damaged.
     """
-    folder = files.absolute(folder)
+    folder = mirror.local(folder)
     episodes: PushEpisode | GraspEpisode | SettledScene
     episodes, _ = load(folder, kind=str(summary(folder)["kind"]))
     return episodes

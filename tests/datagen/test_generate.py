@@ -112,8 +112,8 @@ def test_the_manifest_is_written_once_however_many_shards_there_are(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[int] = []
-    write = manifest._write
-    monkeypatch.setattr(manifest, "_write", lambda at, entries: written.append(len(entries)) or write(at, entries))
+    write = manifest.write
+    monkeypatch.setattr(manifest, "write", lambda at, entries: written.append(len(entries)) or write(at, entries))
     job = dataclasses.replace(JOB, kind="images", episodes=4, shard_size=1, actions=1)
     generate(job, tmp_path)
     assert written == [4]

@@ -9,7 +9,7 @@ from dipn_jax.eval import cli as eval_cli
 from dipn_jax.eval.clearing.tables import Tables
 from dipn_jax.train import cli as train_cli
 
-from dipn_jax import console, files
+from dipn_jax import addresses, console, files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import resume
 from dipn_jax.world import cases
@@ -41,7 +41,7 @@ def test_every_path_of_every_command_is_absolute_when_it_begins(
 ) -> None:
     commands, name, command = EVERY[which]
     hints = {key: str(kind) for key, kind in command.__annotations__.items()}
-    wanted = {key: kind for key, kind in hints.items() if "pathlib.Path" in kind}
+    wanted = {key: kind for key, kind in hints.items() if "pathlib.Path" in kind or "Place" in kind}
     assert wanted
     seen: dict[str, Any] = {}
 
@@ -54,10 +54,16 @@ def test_every_path_of_every_command_is_absolute_when_it_begins(
         shown = {"clears": "clear", "predictions": "prediction", "grasps": "grasp", "sweeps": "sweep"}.get(key, key)
         option = [] if "Positional" in kind else [f"--{shown.replace('_', '-')}"]
         arguments += [*option, "~/lit", *(["there/x"] if "tuple" in kind else [])]
-    assert console.run("test", commands | {name: called}, arguments) == 0
+    given = commands | {name: called}
+    assert console.run("test", given, arguments) == 0
     for key, kind in wanted.items():
         expected = [home / "lit", *([pathlib.Path.cwd() / "there" / "x"] if "tuple" in kind else [])]
         assert _paths(seen[key]) == expected, key
+    urls = ["s3://bucket/x" if word == "~/lit" else word for word in arguments]
+    places = {key for key, kind in wanted.items() if "Place" in kind}
+    assert console.run("test", given, urls) == (0 if places == wanted.keys() else 2)
+    if places == wanted.keys():
+        assert all(addresses.url(_paths(seen[key])[0]) == "s3://bucket/x" for key in places)
 
 
 def test_builtin_is_a_name_and_stays_one(home: pathlib.Path) -> None:

@@ -1,0 +1,236 @@
+"""Where a data set is written: a folder, or object storage, where a shard is there once somebody has created it.
+
+Shards are written to a folder in either case. In object storage that folder is a temporary one of this process, each
+shard is then created, which one writer wins, and nothing else is locked or renamed.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import pathlib
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+from dipn_jax import addresses, console, files
+from dipn_jax.storage import accounting, manifest, mirror, records, shards
+from dipn_jax.storage.manifest import MANIFEST
+from dipn_jax.storage.objects import Bucket
+
+CONFIG = mirror.CONFIG
+FEW = 20
+"""Shards that are looked at without a progress line."""
+Claim = Callable[[pathlib.Path], None]
+"""Writes the configuration of a data set to its folder, or raises UserError if another one is there."""
+
+
+class Place(Protocol):
+    """Where a data set is written."""
+
+    name: str  # for the user
+    folder: pathlib.Path  # in which shards are written
+
+    def begun(self) -> bool:
+        """Return whether there is a configuration."""
+
+    def claim(self, claim: Claim) -> None:
+        """Let `claim` write the configuration, or compare it with the one that is there."""
+
+    def note(self, command: Sequence[str], *, of: int) -> None:
+        """Keep the command, as `accounting.note`."""
+
+    def counts(self, indices: Sequence[int]) -> dict[int, int]:
+        """Return the number of episodes in each of these shards that is there."""
+
+    def entry(self, index: int) -> dict[str, Any]:
+        """Return the entry in the manifest of a shard that `counts` has found."""
+
+    def forget(self, indices: Collection[int]) -> None:
+        """Take shards out of the manifest that are about to be made."""
+
+    def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
+        """Take in the shard that has been written to the folder; return the entry of the one that is now there."""
+
+    def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
+        """Write the manifest, with the entries of the shards that were made by their names, and return it."""
+
+
+class Folder:
+    """A folder on a disk."""
+
+    def __init__(self, folder: pathlib.Path) -> None:
+        console.require_out(folder)
+        self.name, self.folder = str(folder), folder
+
+    def begun(self) -> bool:
+        return (self.folder / CONFIG).exists()
+
+    def claim(self, claim: Claim) -> None:
+        claim(self.folder)
+
+    def note(self, command: Sequence[str], *, of: int) -> None:
+        accounting.note(self.folder, command, of=of)
+
+    def counts(self, indices: Sequence[int]) -> dict[int, int]:
+        paths = {index: shards.shard_path(self.folder, index) for index in indices}
+        return {index: shards.count(path) for index, path in paths.items() if path.exists()}
+
+    def entry(self, index: int) -> dict[str, Any]:
+        return shards.entry(shards.shard_path(self.folder, index))
+
+    def forget(self, indices: Collection[int]) -> None:
+        manifest.forget(self.folder, {_name(index) for index in indices})
+
+    def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
+        return entry
+
+    def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
+        return manifest.update_manifest(self.folder, made=made)
+
+
+class Objects:
+    """A data set in object storage, and a temporary folder."""
+
+    def __init__(self, url: str, folder: pathlib.Path) -> None:
+        self.name, self.folder = url, folder
+        self._bucket = Bucket(url, make=True)
+        self._entries: dict[str, Any] = {}  # of shards that are there, by name
+
+    def begun(self) -> bool:
+        return self._bucket.get(CONFIG) is not None
+
+    def claim(self, claim: Claim) -> None:
+        """As `Place.claim`. Of two that begin at the same time, the second compares with what the first has written."""
+        path = self.folder / CONFIG
+        while True:
+            there = self._fetched(CONFIG)
+            claim(self.folder)
+            mine = path.read_bytes()
+            if there:
+                if mine != there:  # more episodes are asked for
+                    self._bucket.put(CONFIG, mine)
+                return
+            if self._bucket.create(CONFIG, mine):
+                return
+
+    def note(self, command: Sequence[str], *, of: int) -> None:
+        accounting.note(self.folder, command, of=of)
+        self._bucket.put(accounting.ASKED, (self.folder / accounting.ASKED).read_bytes())
+
+    def counts(self, indices: Sequence[int]) -> dict[int, int]:
+        """As `Place.counts`: shards that the manifest does not list are fetched to be looked at."""
+        there = self._bucket.list()
+        known = self._listed() | self._entries
+        names = {index: _name(index) for index in indices if _name(index) in there}
+        self._entries = {
+            name: known[name] for name in names.values() if name in known and known[name]["bytes"] == there[name].size
+        }
+        todo = [name for name in names.values() if name not in self._entries]
+        with (
+            console.Progress("look", len(todo), unit="shards", quiet=len(todo) < FEW) as progress,
+            concurrent.futures.ThreadPoolExecutor(mirror.AT_ONCE) as pool,
+        ):
+            for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
+                self._entries |= {name: entry} if entry else {}
+                progress.advance(1)
+        return {index: int(self._entries[name]["episodes"]) for index, name in names.items() if name in self._entries}
+
+    def entry(self, index: int) -> dict[str, Any]:
+        return dict(self._entries[_name(index)])
+
+    def forget(self, indices: Collection[int]) -> None:
+        """As `Place.forget`; only a shorter shard, of fewer episodes, can be listed."""
+        names = {_name(index) for index in indices} & self._entries.keys()
+        for name in names:
+            del self._entries[name]
+        listed = self._listed()
+        if names & listed.keys():
+            self._write({name: entry for name, entry in listed.items() if name not in names})
+
+    def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
+        """As `Place.commit`; where another writer was first, it is his entry, unless his shard is a shorter one."""
+        name = _name(index)
+        data = (self.folder / name).read_bytes()
+        try:
+            while not self._bucket.create(name, data):
+                theirs = self._looked_at(name)
+                if theirs and theirs["episodes"] == entry["episodes"]:
+                    return theirs
+                self._bucket.delete(name)
+            return entry
+        finally:
+            (self.folder / name).unlink(missing_ok=True)
+
+    def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
+        """As `Place.list`; of workers that end at the same time, the last one's counts, and readers find the rest."""
+        known = self._listed() | self._entries | dict(made)
+        there = self._bucket.list()
+        held = {name: known[name] for name in there if name in known and known[name]["bytes"] == there[name].size}
+        return self._write(held)
+
+    def _fetched(self, name: str) -> bytes:
+        """Return the content of an object, which is then in the folder; nothing where there is none."""
+        got = self._bucket.get(name)
+        if got is None:
+            (self.folder / name).unlink(missing_ok=True)
+            return b""
+        files.write_atomically(self.folder / name, got[0])
+        return got[0]
+
+    def _looked_at(self, name: str) -> dict[str, Any] | None:
+        """Return the entry of a shard that is there; None where it is not."""
+        got = self._bucket.get(name)
+        if got is None:
+            return None
+        path = self.folder / name
+        try:
+            path.write_bytes(got[0])
+            return shards.entry(path)
+        finally:
+            path.unlink(missing_ok=True)
+
+    def _listed(self) -> dict[str, Any]:
+        return manifest.listed(self.folder) if self._fetched(MANIFEST) else {}
+
+    def _write(self, entries: dict[str, Any]) -> dict[str, Any]:
+        found = manifest.write(self.folder, entries)
+        self._bucket.put(MANIFEST, (self.folder / MANIFEST).read_bytes())
+        return found
+
+
+def _name(index: int) -> str:
+    return shards.shard_path(pathlib.Path(), index).name
+
+
+@contextlib.contextmanager
+def opened(out: pathlib.Path) -> Iterator[Place]:
+    """Return a context whose value is where a data set is written: the folder `out`, or what is at the URL.
+
+    Raises:
+      UserError: it cannot be written to.
+    """
+    url = addresses.url(out)
+    if url is None:
+        yield Folder(out)
+        return
+    with tempfile.TemporaryDirectory(prefix="dipn-datagen-") as folder:
+        addresses.call(pathlib.Path(folder), url)
+        yield Objects(url, pathlib.Path(folder))
+
+
+def repair(url: str) -> list[pathlib.Path]:
+    """Rename damaged shards at a URL to `*.damaged`, rebuild the manifest, and return the former paths in the copy.
+
+    Raises:
+      UserError: as `records.repair`, or as `mirror.local`.
+    """
+    bucket, copy = Bucket(url), mirror.fresh(url)
+    removed = records.repair(copy)
+    for path in removed:
+        got = bucket.get(path.name)
+        if got is not None:
+            bucket.put(f"{path.name}.damaged", got[0])
+            bucket.delete(path.name)
+    bucket.put(MANIFEST, (copy / MANIFEST).read_bytes())
+    return removed
