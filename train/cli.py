@@ -60,11 +60,11 @@ def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
         yield Room(compute.memory, out / "examples" / str(compute.process))
 
 
-def _local(data: tuple[pathlib.Path, ...]) -> tuple[pathlib.Path, ...]:
-    """Return the folders of data sets: those given, and copies of what is at URLs."""
+def _local(data: pathlib.Path | tuple[pathlib.Path, ...]) -> tuple[pathlib.Path, ...]:
+    """Return the folders of one data set or several: those given, and copies of what is at URLs."""
     from dipn_jax.storage import mirror
 
-    return tuple(map(mirror.local, data))
+    return tuple(map(mirror.local, (data,) if isinstance(data, pathlib.Path) else data))
 
 
 def _initial(init: pathlib.Path | None, network: str) -> Any:
