@@ -8,7 +8,7 @@ import pathlib
 from typing import Any
 
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # as `console` sets it for the commands: JAX reads it when it is imported
-# compiling takes most of the time of the tests, and a sixth less so; what XLA computes differs by rounding
+# compiling is much of the time of the tests, and takes less so; what XLA computes differs by rounding
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
 gc.set_threshold(200_000, 50, 1000)  # traced programs are millions of objects that stay
 

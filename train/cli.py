@@ -50,6 +50,8 @@ def _join(compute: Compute) -> None:
 @contextlib.contextmanager
 def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
     """Say where the examples of a run are kept; those of a program that is only compiled are not."""
+    import jax
+
     from .example_store import Room
 
     console.require_between(0, 1e6, memory=compute.memory)
@@ -57,7 +59,7 @@ def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
         with tempfile.TemporaryDirectory() as folder:
             yield Room(0, pathlib.Path(folder) / "examples")
     else:
-        yield Room(compute.memory, out / "examples" / str(compute.process))
+        yield Room(compute.memory, out / "examples" / str(jax.process_index()))
 
 
 def _local(data: pathlib.Path | tuple[pathlib.Path, ...]) -> tuple[pathlib.Path, ...]:

@@ -23,7 +23,7 @@ TASK = "push"
 CHUNK = 1000
 """Number of files in a folder."""
 STATISTICS = ("min", "max", "mean", "std", "count")
-"""What is told of every feature, of each episode and of all."""
+"""Statistics that are written of every feature, for each episode and for the data set."""
 _PICTURES = ("color", "height", "label")
 _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 

@@ -12,17 +12,17 @@ from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
 
 def apart(engine: Engine) -> Engine:
-    """Return `engine`, made to simulate scenes of as many objects together, if it is `native`.
+    """Return an engine that simulates only scenes with equal numbers of objects together, if `engine` is `native`.
 
-    That engine gives all scenes of a batch as many bodies as the fullest has. The bodies that a scene lacks touch
-    nothing, but they change the last digits of what its solver finds. MJX has a body for every slot, and its results
+    `native` gives all scenes of a batch as many bodies as the fullest one has. A scene's unused bodies touch nothing,
+    but they change the last digits of the solver's result. MJX has a body for every slot, and its results
     depend on no neighbour; in MuJoCo Warp scenes share their room for contacts, so there they may.
     """
     return Grouped(engine) if engine.name == "native" else engine
 
 
 class Grouped:
-    """An `Engine` that gives another one only scenes of as many objects at a time."""
+    """An `Engine` that splits batches by number of objects and passes each part to another engine."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine

@@ -1,7 +1,7 @@
 """The list of a data set's shards: `manifest.json`, with their sizes and SHA-256.
 
-It is a function of the shards, and is written when generation ends. Whoever reads a data set looks for shards that it
-does not list, because generation goes on or was killed, and takes them as they are.
+It is a function of the shards, and is written when generation ends. While generation runs, or where it was killed,
+there are shards that the manifest does not list: readers look for them and read them, too.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def measured(
 
 
 def groups(scenes: int) -> int:
-    """Return the number of groups of so many scenes."""
+    """Return the number of groups that a number of scenes is split into."""
     return -(-scenes // GROUP)
 
 

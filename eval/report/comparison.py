@@ -13,7 +13,7 @@ from dipn_jax import files, pages, typed
 from dipn_jax.errors import UserError
 
 from .. import drawing
-from ..clearing import film, lockstep
+from ..clearing import film, lockstep, merging
 from . import paper
 
 FRAMES = 10
@@ -34,16 +34,8 @@ CAUSES = {
 
 _SETTINGS = {"method": str, "label": str, "tables.cases": str, "tables.objects": object}
 """Form of `settings.json`."""
-_EPISODE = {
-    "name": str,
-    "file": str,
-    "ended": {"cleared", "pushed out", "out of actions", "fault"},
-    "objects": typed.Whole(1),
-    "removed": typed.Whole(),
-    "grasps": typed.Whole(),
-    "pushes": typed.Whole(),
-}
-"""Form of an entry of `episodes.json`."""
+_EPISODE = {name: form for name, form in merging.EPISODE.items() if name != "held"}
+"""What a report reads of an entry of `episodes.json`."""
 
 
 class Cleared:

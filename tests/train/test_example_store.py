@@ -109,3 +109,7 @@ def test_the_command_keeps_them_beside_the_run_and_closes_them(
         words = ["grasp", "--data", str(data["grasp"]), "--out", str(out), *extra]
         assert console.run("test", cli.COMMANDS, words) == 0
         assert (out / "examples" / "0" / "whole.json").exists() == wanted
+    monkeypatch.setattr(jax, "process_index", lambda: 3)  # as where a job manager has started several
+    words = ["grasp", "--data", str(data["grasp"]), "--out", str(tmp_path / "several"), "--memory", "0"]
+    assert console.run("test", cli.COMMANDS, words) == 0
+    assert [path.name for path in (tmp_path / "several" / "examples").iterdir()] == ["3"]

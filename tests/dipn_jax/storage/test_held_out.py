@@ -10,7 +10,7 @@ from dipn_jax.storage import held_out
 
 
 def _sizes(*lengths: int) -> np.ndarray:
-    """Return sizes `[B, 2, 3]` of scenes with so many episodes each."""
+    """Return sizes `[B, 2, 3]` of scenes that have these numbers of episodes."""
     return np.repeat(np.arange(1.0, len(lengths) + 1), lengths)[:, None, None] * np.full((1, 2, 3), 0.01)
 
 

@@ -42,7 +42,7 @@ def test_a_killed_generation_is_read_as_far_as_it_came(
     assert same == fingerprint and (again.poses == whole.poses).all()
     assert capsys.readouterr().err == ""
     update_manifest(copy)
-    assert (copy / MANIFEST).read_bytes() == written, "whoever writes it, it is the same"
+    assert (copy / MANIFEST).read_bytes() == written, "it is a function of the shards"
 
 
 def test_what_a_killed_generation_did_not_make_is_missing(
