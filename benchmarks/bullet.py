@@ -113,7 +113,10 @@ def our_depth(seed: int, count: int) -> float:
         data = mujoco.MjData(compiled)
         data.qpos[2] = data.ctrl[2] = 2.0  # the gripper is away
         data.qpos[model.GRIPPER_DOF :] = np.asarray(poses[i]).reshape(-1)
-        for _ in range(round(primitives.SETTLE_TIME / compiled.opt.timestep)):
+        while data.time < primitives.SETTLE_TIME:
+            falling = data.time < primitives.SETTLE_TIME - native.ACCURATE_TIME
+            config = native.DEFAULTS
+            compiled.opt.timestep = config.falling_timestep if falling else config.timestep
             mujoco.mj_step(compiled, data)
             depths.append(-data.contact.dist[data.contact.dist < 0])
     return float(np.quantile(np.concatenate(depths), DEPTH_QUANTILE))

@@ -18,6 +18,7 @@ class PhysicsConfig:
     """Solver settings, chosen by measurement; MuJoCo's documentation explains each option."""
 
     timestep: float = 0.002  # seconds
+    falling_timestep: float = 0.0  # seconds of a step while objects are dropped (0: as `timestep`); `native` only
     iterations: int = 50
     ls_iterations: int = 50
     impratio: float = 10.0  # halves the slip of a lifted object

@@ -93,7 +93,7 @@ def make_engine(
 
     Args:
       name: engine, or `auto`.
-      timestep: seconds of a physics step, instead of the engine's own.
+      timestep: seconds of every physics step, instead of the engine's own.
       sleep: `PhysicsConfig.sleep`, instead of the engine's own; only `native` can.
       threads: on which `native` simulates, one a core if not given; no result depends on it.
 
@@ -124,5 +124,6 @@ def _configured(config: PhysicsConfig, timestep: float | None, sleep: float | No
     return dataclasses.replace(
         config,
         timestep=config.timestep if timestep is None else timestep,
+        falling_timestep=config.falling_timestep if timestep is None else 0.0,
         sleep=config.sleep if sleep is None else sleep,
     )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
+import copy
+import dataclasses
 import threading
 
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from mujoco import batch as mujoco_batch
 
 from dipn_jax import physics, structs
@@ -21,8 +23,14 @@ from dipn_jax.world import model
 from dipn_jax.world.model import GRIPPER_DOF
 from dipn_jax.world.scenes import parked
 
-DEFAULTS = PhysicsConfig(sleep=1e-3)
-"""Sleeping halves the time and moves objects, after 5 cm of a push, by 0.01 mm (p50) and 0.4 mm (p90)."""
+DEFAULTS = PhysicsConfig(falling_timestep=0.01 / 3, sleep=1e-3)
+"""Sleeping halves the time and moves objects, after 5 cm of a push, by 0.01 mm (p50) and 0.4 mm (p90).
+
+With the larger steps of a drop objects come to rest as with 2 ms; with 5 ms they would lie lower and farther apart
+(`python -m benchmarks drops.cheaper`).
+"""
+ACCURATE_TIME = 0.5
+"""Seconds at the end of a drop that have steps of `PhysicsConfig.timestep`."""
 CAMERA_HEIGHT = 1.0
 """Metres above the table that rays are cast from."""
 MODELS_KEPT = 256
@@ -57,7 +65,11 @@ class NativeEngine:
         packed, slots = hosted.pack(scenes, poses)
         with self._building:
             models = self._compile(packed)
-        sims = _Worlds(models, self)
+        dropped = settle and fence > 0 and self.config.falling_timestep
+        falling = float(samples[-1]) - ACCURATE_TIME if dropped else 0.0
+        targets = np.asarray(trajectories.target)
+        still = (targets == targets[:, :1]).all((1, 2))
+        sims = _Worlds(models, self, present=np.asarray(packed.shape) >= 0, still=still, falling=falling)
         start = np.where(
             packed.shape[..., None] >= 0, np.take_along_axis(poses, slots[..., None], 1), parked(packed.shape.shape[1])
         )
@@ -90,13 +102,28 @@ class NativeEngine:
 class _Worlds:
     """See `hosted.Worlds`: views of a batch's fields."""
 
-    def __init__(self, models: list[mujoco.MjModel], engine: NativeEngine) -> None:
-        self._engine, self._models = engine, models
+    def __init__(
+        self,
+        models: list[mujoco.MjModel],
+        engine: NativeEngine,
+        *,
+        present: Bool[np.ndarray, "B N"],
+        still: Bool[np.ndarray, " B"],
+        falling: float,
+    ) -> None:
+        """Make worlds with objects where `present`, and with hands that never move where `still`.
+
+        For the first `falling` seconds their steps are of `PhysicsConfig.falling_timestep`.
+        """
+        models = [copy.copy(one) for one in models] if falling > 0 else models  # their time step is going to change
+        self._engine, self._models, self._present, self._still = engine, models, present, still
+        self._tick, self._falling = 0, max(0, round(falling / physics.CONTROL_PERIOD))
         # persistent, for sleep
         self._batch = batch = mujoco_batch.Batch(models[0], nsim=len(models), nthread=engine.threads, persistent=True)
         batch.set_models(models)
         self.qpos, self.qvel, self.ctrl, self.qfrc_applied = map(batch.bind, ("qpos", "qvel", "ctrl", "qfrc_applied"))
         self._nearest = batch.bind("sensordata")  # [B, 1] metres: the only sensor of `model.mjcf`
+        self._awake = batch.bind("tree_awake")  # [B, 1 + N]: the hand, then the objects
 
     @property
     def warning(self) -> np.ndarray:
@@ -104,15 +131,30 @@ class _Worlds:
         return np.asarray(self._batch.warning)
 
     def advance(self) -> tuple[np.ndarray, np.ndarray]:
-        """See `hosted.Worlds`."""
+        """See `hosted.Worlds`. Where the hand is still and everything sleeps, nothing is to be computed."""
         if self._engine.stopped.is_set():
             raise Stopped
+        substeps = self._substeps()
+        asleep = (self._awake[:, 1:] == 0) | ~self._present
+        resting = self._still & asleep.all(-1)  # what a fence pushes does not sleep
+        moving = np.flatnonzero(~resting) if self._tick > 1 else None  # before a first step nothing is known of sleep
         try:
-            self._batch.step(nstep=self._engine.substeps)
+            self._batch.step(moving, nstep=substeps)
         except mujoco_batch.SimulationError as error:
             cramped = np.array(["memory" in self._batch.error(int(i)) for i in error.ids], bool)
             return np.asarray(error.ids)[~cramped], np.asarray(error.ids)[cramped]
         return np.zeros(0, int), np.zeros(0, int)
+
+    def _substeps(self) -> int:
+        """Return the number of steps of the next control period, and give the models their time step."""
+        config = self._engine.config
+        if self._tick < self._falling:
+            config = dataclasses.replace(config, timestep=config.falling_timestep)
+        if self._falling and self._tick in (0, self._falling):
+            for one in self._models:
+                one.opt.timestep = config.timestep
+        self._tick += 1
+        return physics.substeps(config)
 
     def last_depths(self) -> np.ndarray:
         """See `hosted.Worlds`."""
