@@ -1,7 +1,7 @@
 """Tasks of a job, on the machines of a Ray cluster. Importing this imports neither Ray nor JAX.
 
 A task writes its result to the folder that all machines share, and returns a few words about it. One that is lost, with
-its process or its machine, is run again, as often as need be; a mistake of the user's ends the job with its line.
+its process or its machine, is run again, up to RETRIES times; a mistake of the user's ends the job with its line.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from dipn_jax.interruption import STOPS
 
 AHEAD = 2
 """Tasks that are submitted for each one that the cluster can run at a time."""
+RETRIES = 16
+"""Times that a task is run again whose process or machine died: machines come and go, but a task can be at fault."""
 STORE_BYTES = 100 * 2**20
 """Memory for results of tasks, on a cluster that is started here: they are a few words."""
 
@@ -65,12 +67,13 @@ def run(
       launch: what a task needs.
 
     Raises:
-      UserError: a task raised it, and the others are given up; or there is no Ray or no cluster.
+      UserError: a task raised it, or its process died each time, and the others are given up; or there is no Ray or no
+        cluster.
     """
     with _connected() as ray:
         _warn_of_too_little(ray, launch)
         needs = {"num_cpus": launch.num_cpus, "num_gpus": launch.num_gpus}
-        remote = ray.remote(max_retries=-1, retry_exceptions=False, **needs)(_attempt)
+        remote = ray.remote(max_retries=RETRIES, retry_exceptions=False, **needs)(_attempt)
         waiting, going = list(enumerate(tasks))[::-1], dict[Any, int]()
         try:
             while waiting or going:
@@ -79,13 +82,25 @@ def run(
                     going[remote.remote(function, task)] = number
                 for done in ray.wait(list(going), num_returns=1)[0]:
                     number = going.pop(done)
-                    result, said = ray.get(done)
-                    if said is not None:
-                        raise UserError(said)
-                    yield number, result
+                    yield number, _result(ray, done, function)
         finally:
             for left in going:
                 ray.cancel(left, force=True)
+
+
+def _result(ray: Any, task: Any, function: Callable[..., Any]) -> Any:
+    """Return the result of a task that has ended; raise UserError where it cannot be had."""
+    try:
+        result, said = ray.get(task)
+    except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError, ray.exceptions.OutOfMemoryError) as error:
+        why = " ".join(str(error).split())[:200]
+        raise UserError(
+            f"{function.__name__}: a task's process died {RETRIES + 1} times ({why}); see Ray's logs on that machine, "
+            "and give tasks more memory or a smaller --shard-size"
+        ) from None
+    if said is not None:
+        raise UserError(said)
+    return result
 
 
 def _attempt(function: Callable[..., Any], task: tuple[Any, ...]) -> tuple[Any, str | None]:

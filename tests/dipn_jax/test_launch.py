@@ -18,6 +18,10 @@ class _Ray(types.ModuleType):
         super().__init__("ray")
         self.cores, self.options = cores, dict[str, Any]()
         self.most_going, self.cancelled = 0, list[Any]()
+        dead = {
+            name: type(name, (Exception,), {}) for name in ("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError")
+        }
+        self.exceptions = types.SimpleNamespace(**dead)
 
     def is_initialized(self) -> bool:
         return True
@@ -64,7 +68,7 @@ def test_every_task_is_done_once_and_few_are_submitted_at_a_time(ray: _Ray) -> N
     found = dict(launch.run(_double, tasks, launch=Launch("ray", num_cpus=1.0)))
     assert found == {number: 2 * (20 + number) for number in range(20)}
     assert ray.most_going == 4 and ray.cancelled == []
-    assert ray.options == {"num_cpus": 1.0, "num_gpus": 0.0, "max_retries": -1, "retry_exceptions": False}
+    assert ray.options == {"num_cpus": 1.0, "num_gpus": 0.0, "max_retries": launch.RETRIES, "retry_exceptions": False}
 
 
 @pytest.mark.parametrize(("number", "says"), [(5, "five: want another number"), (6, "/data: No space left on device")])
@@ -72,6 +76,15 @@ def test_a_mistake_of_the_users_ends_the_job_and_the_others_are_given_up(number:
     with pytest.raises(UserError, match=says):
         list(launch.run(_double, [(1,), (2,), (number,), (3,), (4,)], launch=Launch("ray")))
     assert [task[1] for _, task in ray.cancelled] == [(1,), (2,)]
+
+
+def test_a_task_whose_process_always_dies_ends_the_job(ray: _Ray) -> None:
+    def dies(number: int) -> int:
+        raise ray.exceptions.WorkerCrashedError("segmentation\nfault")
+
+    with pytest.raises(UserError, match=r"dies: a task's process died 17 times \(segmentation fault\)"):
+        list(launch.run(dies, [(1,), (2,)], launch=Launch("ray")))
+    assert [task[1] for _, task in ray.cancelled] == [(1,)]
 
 
 def test_what_no_machine_has_is_said(ray: _Ray, capsys: pytest.CaptureFixture[str]) -> None:
