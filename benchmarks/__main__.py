@@ -84,6 +84,9 @@ BENCHMARKS = {
     "engines.scene_seconds": Benchmark(
         "seconds of heaps of seven objects simulated a second, by each engine", "none", "rates:scene_seconds"
     ),
+    "jobs.overhead": Benchmark(
+        "milliseconds, memory and bytes a shard of a data set of many, without physics", "none", "jobs:overhead"
+    ),
     "rates.native": Benchmark("episodes a second of MuJoCo C, 1 to 30 objects", "none", "rates:native"),
     "rates.mjx": Benchmark("episodes a second of MJX, 1 to 30 objects", "none", "rates:mjx"),
     "rates.warp": Benchmark("episodes a second of MuJoCo Warp, 1 to 30 objects", "none", "rates:warp"),
