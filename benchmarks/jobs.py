@@ -24,8 +24,11 @@ from dipn_jax.world import scenes
 
 JOB = Job(kind="push", scene=scenes.fixed_count(1), episodes=1, seed=0, shard_size=1, actions=1, engine="native")
 """A data set whose shards have one push each."""
-COUNTS = {"small": (100,), "full": (1_000, 10_000, 100_000)}
-"""Numbers of shards."""
+COUNTS = {
+    "small": {"local": (100,), "ray": (100,)},
+    "full": {"local": (1_000, 10_000), "ray": (1_000, 10_000, 100_000)},
+}
+"""Numbers of shards of each launcher."""
 
 
 @functools.cache
@@ -39,6 +42,11 @@ def make_shard(*arguments: Any) -> tuple[str, dict[str, Any]]:
     push = _one_push()
     with mock.patch.object(generate, "shard", lambda *_: push):
         return spread.make_shard(*arguments)
+
+
+def _do_nothing(index: int) -> int:
+    """Return the number of a task: one that costs nothing but its launch."""
+    return index
 
 
 def _elsewhere(job: Job, todo: Sequence[int], out: pathlib.Path) -> Generator[tuple[str, dict[str, Any]], None, None]:
@@ -73,11 +81,18 @@ def _peak() -> float:
 
 
 def overhead(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Measure `jobs.overhead/LAUNCHER/SHARDS/...` for shards of one push each, nothing of which is simulated."""
+    """Measure `jobs.overhead/LAUNCHER/SHARDS/...` for shards of one push each, nothing of which is simulated.
+
+    `jobs.overhead/launch_milliseconds` is of a task of Ray's that does nothing: the driver's own time.
+    """
     if importlib.util.find_spec("ray") is None:
         raise Skipped("Ray is not installed; run pip install 'dipn-jax[ray]'")
-    for count in COUNTS[setting.scale]:
-        for name in ("local", "ray"):
+    for name, counts in COUNTS[setting.scale].items():
+        for count in counts:
             with tempfile.TemporaryDirectory() as folder, multiprocessing.get_context("spawn").Pool(1) as pool:
                 for key, value in pool.apply(_run, (name, count, pathlib.Path(folder))).items():
                     yield f"jobs.overhead/{name}/{count}/{key}", value
+    count = setting.pick(200, 20_000)
+    with quiet():
+        taken = seconds(lambda: list(launch.run(_do_nothing, [(i,) for i in range(count)], launch=Launch("ray"))))
+    yield "jobs.overhead/launch_milliseconds", 1000 * taken / count

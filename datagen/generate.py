@@ -64,6 +64,11 @@ class Job:
         console.require_seed(self.seed)
         for distance in self.distances:
             console.require_between(0.01, PUSH_STEPS * 0.01, distances=distance)
+        if self.shards() > shards.MOST_SHARDS:
+            raise UserError(
+                f"--episodes {self.episodes} --shard-size {self.shard_size}: {self.shards()} shards, more than their "
+                f"names can number ({shards.MOST_SHARDS}); give a larger --shard-size"
+            )
         number = len(self.distances)
         if len(set(self.distances)) < max(number, 1):
             raise UserError(f"--distances {self.distances}: want at least one, and none twice")

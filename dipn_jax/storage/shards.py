@@ -48,6 +48,10 @@ class DamagedShard(UserError):
         self.what = what
 
 
+MOST_SHARDS = 100_000
+"""Shards of a data set: with more, the order of their names would not be that of their numbers."""
+
+
 def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
     """Return the path of shard `index` of a data set."""
     return folder / f"shard-{index:05d}.parquet"

@@ -183,6 +183,8 @@ def test_invalid_options_are_refused(tmp_path: pathlib.Path) -> None:
     for timestep in (-0.002, 0.004, 0.0, 1e-9, 1e-320):
         with pytest.raises(UserError, match="timestep"):
             generate(dataclasses.replace(JOB, timestep=timestep), tmp_path / "x")
+    with pytest.raises(UserError, match="100001 shards, more than"):
+        dataclasses.replace(JOB, episodes=100_001, shard_size=1)
     with pytest.raises(UserError, match="--seed"):
         generate(dataclasses.replace(JOB, seed=-1), tmp_path / "x")
     (tmp_path / "file").touch()
