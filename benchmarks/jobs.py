@@ -24,7 +24,7 @@ from dipn_jax.world import scenes
 
 JOB = Job(kind="push", scene=scenes.fixed_count(1), episodes=1, seed=0, shard_size=1, actions=1, engine="native")
 """A data set whose shards have one push each."""
-COUNTS = {
+COUNTS: dict[str, dict[str, tuple[int, ...]]] = {
     "small": {"local": (100,), "ray": (100,)},
     "full": {"local": (1_000, 10_000), "ray": (1_000, 10_000, 100_000)},
 }
