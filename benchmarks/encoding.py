@@ -94,12 +94,17 @@ def writing_rate(objects: int, episodes: int, *, shards: int, real: int, seed: i
         return task.episodes / seconds(lambda: make_data(task))
 
 
+def make_without_physics(task: generate.Job) -> int:
+    """Make a data set as `harness.make_data` does, with `Resting` as its engine."""
+    with mock.patch.object(generate, "make_engine", lambda *_, **__: Resting()):
+        return make_data(task)
+
+
 def pipeline_rate(objects: int, episodes: int, *, shards: int, seed: int) -> float:
     """Measure the push episodes a second on disk, drawing, rendering and aiming included, with `Resting` as engine."""
     task = job(objects, episodes, shards=shards, seed=seed)
-    with mock.patch.object(generate, "make_engine", lambda *_, **__: Resting()):
-        make_data(task)  # compiles
-        return task.episodes / seconds(lambda: make_data(task))
+    make_without_physics(task)  # compiles
+    return task.episodes / seconds(lambda: make_without_physics(task))
 
 
 def encoding(setting: Setting) -> Iterator[tuple[str, float]]:

@@ -21,8 +21,6 @@ from dipn_jax.planning.planner import NONE_MISSED
 from dipn_jax.structs import Decision, Fault
 from dipn_jax.world import cases, clutter, primitives
 
-MOST_MILLIMETRES = 1.0
-"""Distance (p50) of an engine from MuJoCo C, 5 cm into a push, from which on it is wrong."""
 LEAST_EQUAL = 0.95
 """Share of grasps that end as in MuJoCo C, below which an engine is wrong."""
 REPEATED_SECONDS = 0.5
@@ -35,7 +33,7 @@ def policy(size: Size) -> on_tables.TablePolicy:
     """Return the shipped networks as a policy of many tables, which considers `size.candidates` pushes on each."""
     config = methods.PolicyConfig(candidates=size.candidates, grasp_above=1.0)
     networks = methods.Networks(BUILTIN, BUILTIN)
-    (decide,) = on_tables.load("dipn+gn", networks, engine("native", size.batches[0], size.tail), [config])
+    (decide,) = on_tables.load("dipn+gn", networks, engine("native", size), [config])
     return decide
 
 
@@ -56,7 +54,7 @@ def weights(size: Size) -> Found:
     Raises:
       Wrong: a score is no chance, or a simulation goes wrong.
     """
-    native, path = engine("native", size.batches[0], size.tail), cases.hard_cases_path()
+    native, path = engine("native", size), cases.hard_cases_path()
     names, slots = cases.load_cases(path)[0], table_slots()
     tables = instances.hard_instances(native, path, names[: size.cases], slots=slots, repeats=1, seed=size.seed)
     scene, poses = structs.stack([table.scene for table in tables]), np.stack([table.poses for table in tables])
@@ -113,7 +111,7 @@ def _reference(size: Size) -> tuple[world.Trial, np.ndarray, np.ndarray]:
 
     So an engine makes all pushes in one batch, and all grasps in another of the same size.
     """
-    native = engine("native", size.batches[0], size.tail)
+    native = engine("native", size)
     made = world.trial(jax.random.key(size.seed), native, size.agreeing, config=size.mixed())
     _, poses = world.pushes(native, made)
     held = world.held_by(native, made)
@@ -134,7 +132,7 @@ def _agreement(name: Any, size: Size) -> Found:
     if name == "warp" and not installed("warp"):
         raise NotMeasured("MuJoCo Warp is not installed; install the extra `warp`")
     made, poses, held = _reference(size)
-    tested = engine(name, size.batches[0], size.tail)
+    tested = engine(name, size)
     make_ready(tested, made.items.scene, made.items.poses)
     found = world.agreement(name, tested, made, poses, held)
     shown = {"p50_mm": "5cm/p50_mm", "p90_mm": "5cm/p90_mm", "grasps_equal": "grasp", "grasps_held": "grasps_that_held"}
@@ -142,10 +140,10 @@ def _agreement(name: Any, size: Size) -> Found:
     yield from figures.items()
     yield "scenes", size.agreeing
     distance, equal = figures["p50_mm"], figures["grasps_equal"]
-    if not (distance <= MOST_MILLIMETRES and equal >= LEAST_EQUAL):
+    if not (distance <= size.most_millimetres and equal >= LEAST_EQUAL):
         raise Wrong(
             f"{name} is {distance:.2f} mm (p50) from MuJoCo C and {equal:.1%} of its grasps end alike; "
-            f"want at most {MOST_MILLIMETRES:g} mm and at least {LEAST_EQUAL:.0%}"
+            f"want at most {size.most_millimetres:g} mm and at least {LEAST_EQUAL:.0%}"
         )
     yield "", distance
 
@@ -156,7 +154,7 @@ def reproducible(size: Size) -> Found:
     Raises:
       Wrong: not all of them.
     """
-    tested, made = engine("mjx", size.batches[0], size.tail), _reference(size)[0]
+    tested, made = engine("mjx", size), _reference(size)[0]
     runs = []
     for _ in range(2):
         rollout = primitives.settle(tested, made.items.scene, _raised(made.items.poses), duration=REPEATED_SECONDS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import statistics
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from benchmarks.harness import make_data, seconds
 from dipn_jax import batching, structs
 from dipn_jax.engine import Engine
 from dipn_jax.names import EngineName
-from dipn_jax.physics import cores, make_engine
+from dipn_jax.physics import cores, make_engine, mjx, warp
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.warp import WarpEngine
 from dipn_jax.structs import Fault, Push, Rollout, Scene, Trajectory
@@ -65,29 +66,28 @@ class Padded:
         self.engine.stop()
 
 
-@functools.cache
-def engine(name: EngineName, batch: int, tail: int) -> Engine:
-    """Return an engine by its name, which keeps its programs; an accelerator's takes batches of these two sizes.
+def engine(name: EngineName, size: Size, *, batch: int = 0) -> Engine:
+    """Return an engine by its name; an accelerator's takes batches of `batch` scenes, or `size.batches[0]`, and a tail.
+
+    Engines are kept with their programs.
 
     Raises:
       NotMeasured: it is not installed.
     """
     if name == "native":
         return make_engine("native")
-    return Padded(on_accelerator(name, batch), small=tail, full=batch)
+    full = batch or size.batches[0]
+    return Padded(_kept(name, full, size.timestep), small=min(size.tail, full), full=full)
 
 
-def on_accelerator(name: EngineName, batch: int) -> Engine:
-    """Return MJX or Warp with its own settings, for so many scenes at once.
-
-    Raises:
-      NotMeasured: it is not installed.
-    """
-    if name == "mjx":
-        return MjxEngine(chunk=batch)
-    if not installed("warp"):
+@functools.cache
+def _kept(name: EngineName, batch: int, timestep: float | None) -> Engine:
+    """Return MJX or Warp for `batch` scenes at once, with another time step if one is given."""
+    if name == "warp" and not installed("warp"):
         raise NotMeasured("MuJoCo Warp is not installed; install the extra `warp`")
-    return WarpEngine(chunk=batch)
+    kind, config = (WarpEngine, warp.DEFAULTS) if name == "warp" else (MjxEngine, mjx.DEFAULTS)
+    made: Engine = kind(dataclasses.replace(config, timestep=timestep or config.timestep), chunk=batch)
+    return made
 
 
 def make_ready(engine: Engine, scene: Scene, poses: Any) -> None:
@@ -108,7 +108,9 @@ def drawn(size: Size, count: int) -> tuple[Scene, np.ndarray]:
 
 def push_episodes_vs_native(size: Size) -> Found:
     """Measure push episodes on disk a second, by MuJoCo C on all cores and by each accelerator, and the best ratio."""
-    encoding_alone.pipeline_rate(size.objects, size.shard, shards=1, seed=size.seed)  # compiles all but the engines
+    encoding_alone.make_without_physics(
+        encoding_alone.job(size.objects, size.shard, shards=1, seed=size.seed)
+    )  # compiles
     native = episode_rate("native", size)
     yield "native_episodes_per_second", native
     yield "native_cores", cores()
@@ -130,7 +132,7 @@ def episode_rate(name: EngineName, size: Size) -> float:
 
     A data set that took too little time is made again, larger and of other scenes.
     """
-    made = engine(name, size.batches[0], size.tail)
+    made = engine(name, size)
     if name != "native":
         for count in (size.tail, size.batches[0]):
             make_ready(made, *drawn(size, count))
@@ -151,7 +153,7 @@ def engines(size: Size) -> Found:
         tables = functools.cache(functools.partial(_tables, size, batch))
         for name in ("native", *ACCELERATORS):
             try:
-                made = engine(name, batch, min(size.tail, batch))
+                made = engine(name, size, batch=batch)
             except NotMeasured as reason:
                 yield f"{name}/{batch}", f"not measured: {reason}"
                 continue

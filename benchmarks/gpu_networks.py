@@ -18,22 +18,35 @@ from benchmarks import bench_grasp, grasp_worker, push_net, push_worker, renderi
 from benchmarks.gpu_correctness import check_scores, policy, recall_nothing, table_slots
 from benchmarks.gpu_stage import COMPILING, Found, Size, installed
 from benchmarks.harness import alternate, seconds
-from benchmarks.worker import FLOAT32, Worker
+from benchmarks.worker import Worker
 from dipn_jax.physics import make_engine
 from dipn_jax.world import clutter, scenes
 
-PRECISIONS = (FLOAT32, "bfloat16")
-"""Precisions that networks are trained in."""
 
-
-@dataclasses.dataclass
-class Training:
-    """A training step that is timed: of a network and a preset, in a precision."""
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """A training step: of a network and a preset, on the same inputs in both frameworks."""
 
     name: str
-    batch: int
-    ours: Callable[[], None]  # a step
-    theirs: Worker | None = None  # PyTorch, if it is installed
+    arrays: dict[str, np.ndarray]  # [B, ...]
+    ours: Callable[[dict[str, np.ndarray], str], tuple[Callable[[], None], int]]  # of a precision
+    module: str  # of PyTorch's process
+    arguments: tuple[object, ...]
+
+    @property
+    def batch(self) -> int:
+        """Number of examples."""
+        return len(next(iter(self.arrays.values())))
+
+
+@dataclasses.dataclass(frozen=True)
+class Ready:
+    """A step that has been taken once, in a precision."""
+
+    step: Step
+    precision: str
+    ours: Callable[[], None]
+    theirs: Worker | None  # PyTorch, if it is installed
 
 
 def training(size: Size) -> Found:
@@ -42,68 +55,58 @@ def training(size: Size) -> Found:
     All of them are compiled, and all processes of PyTorch started, at the same time; then they are timed in turns.
     """
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
-        made = list(_trainings(size, pathlib.Path(folder), stack))
         least = np.inf
-        for each in made:
-            ours = functools.partial(_steps, each.ours, size.steps)
+        for each in _made_ready(size, pathlib.Path(folder), stack):
+            name = f"{each.step.name}_{each.precision}"
+            ours = functools.partial(_repeat, each.ours, size.steps)
             if each.theirs is None:
-                yield f"{each.name}_samples_per_second", each.batch * size.steps / seconds(ours)
-                yield each.name, "not measured: PyTorch is not installed; run pip install torch"
+                yield f"{name}_samples_per_second", each.step.batch * size.steps / seconds(ours)
+                yield name, "not measured: PyTorch is not installed; run pip install torch"
                 continue
             mine, theirs = alternate(ours, functools.partial(each.theirs.steps, size.steps), repeats=size.repeats)
             least = min(least, theirs / mine)
-            yield f"{each.name}_samples_per_second", each.batch * size.steps / mine
-            yield each.name, theirs / mine
+            yield f"{name}_samples_per_second", each.step.batch * size.steps / mine
+            yield name, theirs / mine
         if np.isfinite(least):
             yield "", least
 
 
-def _steps(step: Callable[[], None], count: int) -> None:
+def _repeat(step: Callable[[], None], count: int) -> None:
     for _ in range(count):
         step()
 
 
-def _trainings(size: Size, folder: pathlib.Path, stack: contextlib.ExitStack) -> Iterator[Training]:
-    """Return all training steps, ready to be timed; processes end with `stack`."""
-    waiting: list[concurrent.futures.Future[Training]] = []
+def _steps(size: Size) -> Iterator[Step]:
+    """Return the training steps of both networks and all presets."""
+    for preset in size.presets:
+        batch = size.examples or push_net.BATCHES[preset]
+        arrays = push_net.training_examples(preset, batch, size.seed, episodes=72 if size.examples is None else 8)
+        ours: Any = functools.partial(push_worker.jax_step, preset)
+        yield Step(f"push_{preset}", arrays, ours, "push_worker", (preset, batch))
+        batch = size.examples or bench_grasp.BATCHES[preset][0]
+        arrays = bench_grasp.training_examples(preset, batch, size.seed)
+        ours = functools.partial(grasp_worker.jax_step, preset, "train")
+        yield Step(f"grasp_{preset}", arrays, ours, "grasp_worker", (preset, "train"))
+
+
+def _made_ready(size: Size, folder: pathlib.Path, stack: contextlib.ExitStack) -> list[Ready]:
+    """Return all steps in all precisions; processes end with `stack`."""
+
+    def make(step: Step, precision: str) -> Ready:
+        file, theirs = folder / f"{step.name}.npz", None
+        if installed("torch"):
+            theirs = Worker(step.module, "torch", *step.arguments, file, precision)
+            stack.callback(theirs.process.kill)
+        ours, _ = step.ours(step.arrays, precision)
+        ours()  # compiles
+        return Ready(step, precision, ours, theirs)
+
     with COMPILING.counted(), concurrent.futures.ThreadPoolExecutor(8) as pool:
-        for preset in size.presets:
-            pushes = size.examples or push_net.BATCHES[preset]
-            grasps = size.examples or bench_grasp.BATCHES[preset][0]
-            episodes = max(8, 72 if size.examples is None else 4 * size.examples)
-            arrays = push_net.training_examples(preset, pushes, size.seed, episodes=episodes)
-            push = functools.partial(push_worker.jax_step, preset, arrays)
-            waiting += _begin(pool, stack, push, f"push_{preset}", folder, arrays, "push_worker", (preset, pushes))
-            arrays = bench_grasp.training_examples(preset, grasps, size.seed)
-            grasp = functools.partial(grasp_worker.jax_step, preset, "train", arrays)
-            waiting += _begin(pool, stack, grasp, f"grasp_{preset}", folder, arrays, "grasp_worker", (preset, "train"))
-    for each in waiting:
-        yield each.result()
-
-
-def _begin(
-    pool: concurrent.futures.ThreadPoolExecutor,
-    stack: contextlib.ExitStack,
-    ours: Callable[[str], tuple[Callable[[], None], int]],
-    name: str,
-    folder: pathlib.Path,
-    arrays: dict[str, np.ndarray],
-    module: str,
-    arguments: tuple[Any, ...],
-) -> list[concurrent.futures.Future[Training]]:
-    """Let a thread of `pool` make each precision's step ready, in both frameworks."""
-    file = folder / f"{name}.npz"
-    np.savez(file, allow_pickle=False, **arrays)
-
-    def make(precision: str) -> Training:
-        other = Worker(module, "torch", *arguments, file, precision) if installed("torch") else None
-        if other is not None:
-            stack.callback(other.process.kill)
-        step, _ = ours(precision)
-        step()  # compiles
-        return Training(f"{name}_{precision}", len(next(iter(arrays.values()))), step, other)
-
-    return [pool.submit(make, precision) for precision in PRECISIONS]
+        waiting = []
+        for step in _steps(size):
+            np.savez(folder / f"{step.name}.npz", allow_pickle=False, **step.arrays)
+            waiting += [pool.submit(make, step, precision) for precision in size.precisions]
+        return [each.result() for each in waiting]
 
 
 def decisions(size: Size) -> Found:

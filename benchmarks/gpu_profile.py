@@ -36,7 +36,7 @@ def profile(size: Size) -> Found:
     scene, poses = heaps(size.seed, batch, objects=size.objects)
     for name in ACCELERATORS:
         try:
-            made = engine(name, batch, size.tail)
+            made = engine(name, size)
             make_ready(made, scene, poses)
             times = kernels(_traced(made, scene, poses), plane=DEVICE)
         except NotMeasured as reason:
@@ -57,8 +57,10 @@ def profile(size: Size) -> Found:
 def _traced(engine: Any, scene: Any, poses: np.ndarray) -> jax.profiler.ProfileData:
     """Return the profile of some control periods of an engine."""
     still, end = primitives.parked_trajectory(len(poses), 1.0), np.array([PERIODS * CONTROL_PERIOD])
+    options = jax.profiler.ProfileOptions()
+    options.python_tracer_level = 0
     with tempfile.TemporaryDirectory() as name:
-        with jax.profiler.trace(name):
+        with jax.profiler.trace(name, profiler_options=options):
             engine.simulate(scene, poses, still, end)
         found = next(pathlib.Path(name).rglob("*.xplane.pb"), None)
         if found is None:

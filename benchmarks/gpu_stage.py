@@ -48,9 +48,11 @@ class Size:
 
     seed: int
     objects: int = 7  # in a scene
+    timestep: float | None = None  # seconds, of MJX and Warp where their own settings are not what is measured
     batches: tuple[int, ...] = (1024, 4096)  # scenes simulated at once; the first is what most is measured with
     tail: int = 128  # to which the last scenes of a data set are padded
     agreeing: int = 256  # scenes on which engines are compared
+    most_millimetres: float = 1.0  # between an engine and MuJoCo C (p50), 5 cm into a push
     heap_seconds: float = 0.2  # for which falling heaps are simulated
     shard: int = 2790  # push episodes: 1,024 scenes
     least_seconds: float = 15.0  # that a data set has to take for its rate to count
@@ -60,6 +62,7 @@ class Size:
     cases: int = 10  # hard tables on which one action is made
     images: int = 256  # rendered at once
     presets: tuple[str, ...] = ("compact", "paper")
+    precisions: tuple[str, ...] = ("float32", "bfloat16")
     examples: int | None = None  # in a training step; the preset's number if not given
     steps: int = 20  # of training that are timed at once
     repeats: int = 5
@@ -77,9 +80,11 @@ def size_of(*, toy: bool, seed: int) -> Size:
     return Size(
         seed,
         objects=1,
-        batches=(2, 4),
+        timestep=0.005,
+        batches=(2,),
         tail=2,
         agreeing=1,
+        most_millimetres=5.0,
         heap_seconds=0.02,
         shard=2,
         least_seconds=0.0,
@@ -89,6 +94,7 @@ def size_of(*, toy: bool, seed: int) -> Size:
         cases=1,
         images=2,
         presets=("compact",),
+        precisions=("bfloat16",),
         examples=2,
         steps=1,
         repeats=1,
@@ -192,7 +198,10 @@ def main() -> None:
     def say(answer: dict[str, Any]) -> None:
         print(json.dumps(answer), file=answers, flush=True)
 
+    import jax
+
     console.enable_compilation_cache()
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # there are hundreds of small programs
     say({"machine": facts()})
     COMPILING.listen()
     for line in sys.stdin:

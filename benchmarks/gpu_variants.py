@@ -45,8 +45,8 @@ ALL = WARP | MJX
 """All variants by name."""
 
 
-def variant(name: str, *, batch: int) -> Engine:
-    """Return an engine with the settings of `ALL[name]`, for so many scenes at once.
+def variant(name: str, *, batch: int, timestep: float | None = None) -> Engine:
+    """Return an engine with the settings of `ALL[name]`, for so many scenes at once; and a time step, if one is given.
 
     Raises:
       NotMeasured: the engine is not installed, or knows no such setting.
@@ -55,7 +55,7 @@ def variant(name: str, *, batch: int) -> Engine:
         raise NotMeasured("MuJoCo Warp is not installed; install the extra `warp`")
     kind, config = (warp.WarpEngine, warp.DEFAULTS) if name.startswith("warp") else (mjx.MjxEngine, mjx.DEFAULTS)
     options = {"chunk": batch} | {key: value for key, value in ALL[name].items() if key != CONFIG}
-    changes = ALL[name].get(CONFIG, {})
+    changes = ({} if timestep is None else {"timestep": timestep}) | ALL[name].get(CONFIG, {})
     unknown = [key for key in options if key not in inspect.signature(kind).parameters]
     unknown += [key for key in changes if key not in {field.name for field in dataclasses.fields(config)}]
     if unknown:
@@ -92,7 +92,7 @@ def variants(size: Size) -> Found:
     rates: dict[str, float] = {}
     for name in [*list(WARP)[: size.variants], *list(MJX)[: size.variants]]:
         try:
-            engine = variant(name, batch=batch)
+            engine = variant(name, batch=batch, timestep=size.timestep)
             make_ready(engine, scene, poses)
             rates[name] = heap_rate(engine, scene, poses, size)
             yield f"{name}/scene_seconds", rates[name]
