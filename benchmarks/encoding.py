@@ -39,15 +39,20 @@ def job(objects: int, episodes: int, *, shards: int, seed: int) -> generate.Job:
     )
 
 
-def synthetic(objects: int, real: int, count: int, seed: int) -> PushEpisode:
-    """Return `count` push episodes: `real` ones of MuJoCo C again and again, each time at another place.
+def real(objects: int, count: int, seed: int) -> PushEpisode:
+    """Return `count` push episodes of MuJoCo C."""
+    with tempfile.TemporaryDirectory() as name, quiet():
+        folder = pathlib.Path(name) / "data"
+        generate.generate(job(objects, count, shards=1, seed=seed), folder)
+        made: PushEpisode = jax.tree.map(np.asarray, records.read_episodes(folder))
+    return made
+
+
+def synthetic(made: PushEpisode, count: int, seed: int) -> PushEpisode:
+    """Return `count` push episodes: those of `made` again and again, each time at another place.
 
     All poses of an episode move alike, so what rests in it still rests, and compresses as it does in a real one.
     """
-    with tempfile.TemporaryDirectory() as name, quiet():
-        folder = pathlib.Path(name) / "data"
-        generate.generate(job(objects, real, shards=1, seed=seed), folder)
-        made: PushEpisode = jax.tree.map(np.asarray, records.read_episodes(folder))
     found = structs.take(made, np.arange(count) % len(made.fault))
     shift = np.random.default_rng(seed).normal(0.0, SHIFT, (count, 2)).astype(np.float32)
     poses, after = np.array(found.poses), np.array(found.after)
@@ -85,9 +90,9 @@ class Resting:
         """See `Engine.stop`; a call takes no time."""
 
 
-def writing_rate(objects: int, episodes: int, *, shards: int, real: int, seed: int) -> float:
-    """Measure the push episodes a second that are encoded and written, of those that are there already."""
-    made = synthetic(objects, real, episodes, seed)
+def writing_rate(objects: int, episodes: int, *, shards: int, few: int, seed: int) -> float:
+    """Measure the push episodes a second that are encoded and written, of `few` real ones again and again."""
+    made = synthetic(real(objects, few, seed), episodes, seed)
     task = job(objects, episodes, shards=shards, seed=seed)
     with mock.patch.object(generate, "shard", lambda *_: (made, {})):
         make_data(task)
@@ -110,5 +115,5 @@ def pipeline_rate(objects: int, episodes: int, *, shards: int, seed: int) -> flo
 def encoding(setting: Setting) -> Iterator[tuple[str, float]]:
     """Measure `datagen.encoding`, `writing_rate` of seven objects, and `/without_physics`, `pipeline_rate`."""
     many, few = setting.pick(2000, 8000), setting.pick(200, 2000)
-    yield "datagen.encoding", writing_rate(OBJECTS, many, shards=4, real=48, seed=setting.seed)
+    yield "datagen.encoding", writing_rate(OBJECTS, many, shards=4, few=48, seed=setting.seed)
     yield "datagen.encoding/without_physics", pipeline_rate(OBJECTS, few, shards=2, seed=setting.seed)

@@ -203,7 +203,7 @@ def encoding(size: Size) -> Found:
     """Measure how many push episodes a second are encoded and written, and are made where physics costs nothing."""
     yield (
         "",
-        encoding_alone.writing_rate(size.objects, size.written, shards=4, real=min(48, size.written), seed=size.seed),
+        encoding_alone.writing_rate(size.objects, size.written, shards=4, few=min(48, size.written), seed=size.seed),
     )
     yield (
         "without_physics",

@@ -15,17 +15,19 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+COMMAND = (sys.executable, "-m", "benchmarks.gpu_stage")
+"""What is started."""
+
 
 class Worker:
     """The process that measures; see `gpu_stage`. Its children are in its group and end with it."""
 
     def __init__(self) -> None:
         """Start it."""
-        command = [sys.executable, "-m", "benchmarks.gpu_stage"]
         # the device's memory is shared with processes of other frameworks
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | os.environ
         self.process = subprocess.Popen(
-            command,
+            COMMAND,
             cwd=pathlib.Path(__file__).parent.parent,
             env=environment,
             text=True,
