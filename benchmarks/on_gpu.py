@@ -136,14 +136,19 @@ def run(out: pathlib.Path, *, minutes: float, toy: bool, seed: int) -> int:
     return int(any(STAGES[name].is_check and state.startswith("failed") for name, state in states.items()))
 
 
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(prog="python -m benchmarks.on_gpu", description=__doc__)
+    made.add_argument("--out", type=pathlib.Path, required=True, metavar="FILE.json", help="figures and machine")
+    made.add_argument("--minutes", type=float, default=10.0, help="that all of it may take (default: 10)")
+    made.add_argument("--toy", action="store_true", help="rehearse on a CPU, as small as can be")
+    made.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+    return made
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.on_gpu", description=__doc__)
-    parser.add_argument("--out", type=pathlib.Path, required=True, metavar="FILE.json", help="figures and machine")
-    parser.add_argument("--minutes", type=float, default=10.0, help="that all of it may take (default: 10)")
-    parser.add_argument("--toy", action="store_true", help="rehearse on a CPU, as small as can be")
-    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
-    options = parser.parse_args(arguments)
+    options = parser().parse_args(arguments)
     console.enable_compilation_cache()
     return console.exit_code(lambda: run(options.out, minutes=options.minutes, toy=options.toy, seed=options.seed))
 

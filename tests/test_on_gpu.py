@@ -18,6 +18,7 @@ from benchmarks import (
     gpu_stage,
     gpu_variants,
     on_gpu,
+    page,
 )
 from benchmarks.gpu_record import Stage
 from dipn_jax import structs
@@ -79,6 +80,9 @@ def test_a_stage_that_fails_or_dies_is_a_line_and_the_others_go_on(
     assert kept["notes"]["fails"] == "failed: RuntimeError: no" and kept["notes"]["good/second"] == "not measured: no"
     (machine,) = kept["machine"]
     assert machine["devices"] == ["d"] and machine["rows"] == "good, fails, dies, after" and machine["scale"] == "full"
+    assert "| `good/first` |  | 1 |" in page.tables(
+        kept["figures"]
+    ) and "| good, fails, dies, after | p, 2 cores, d | c |" in (page.origins(kept))
     table = capsys.readouterr().out.splitlines()[-4:]
     assert [line.split()[0] for line in table] == ["good", "fails", "dies", "after"]
 
