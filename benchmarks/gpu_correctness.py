@@ -113,7 +113,7 @@ def _reference(size: Size) -> tuple[world.Trial, np.ndarray, np.ndarray]:
     """
     native = engine("native", size)
     made = world.trial(jax.random.key(size.seed), native, size.agreeing, config=size.mixed())
-    _, poses = world.pushes(native, made)
+    poses = np.asarray(primitives.push(native, made.items.scene, made.items.poses, made.pushes).poses)
     held = world.held_by(native, made)
     scenes_, grasps = held.shape[:2]
     rows = np.repeat(np.arange(scenes_), grasps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import statistics
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 from unittest import mock
 
@@ -96,6 +96,7 @@ def make_ready(engine: Engine, scene: Scene, poses: Any) -> None:
         primitives.settle(engine, scene, poses, duration=0.01)
 
 
+@functools.cache
 def drawn(size: Size, count: int) -> tuple[Scene, np.ndarray]:
     """Return `count` random scenes of `size.objects` objects in mid-air, all different, and their poses."""
     config = scenes.fixed_count(size.objects)
@@ -104,6 +105,12 @@ def drawn(size: Size, count: int) -> tuple[Scene, np.ndarray]:
         batching.in_batches(draw, jax.random.split(jax.random.key(size.seed), count))
     )
     return found
+
+
+@functools.cache
+def heaps_of(size: Size, batch: int) -> tuple[Scene, np.ndarray]:
+    """Return `batch` falling heaps of one scene, and their poses, as `datagen_mjx.heaps`."""
+    return heaps(size.seed, batch, objects=size.objects)
 
 
 def push_episodes_vs_native(size: Size) -> Found:
@@ -150,31 +157,28 @@ def engines(size: Size) -> Found:
     """Measure each engine at each batch size: heaps, drops and pushes; the largest batches come last."""
     best: dict[str, float] = {}
     for batch in size.batches:
-        tables = functools.cache(functools.partial(_tables, size, batch))
         for name in ("native", *ACCELERATORS):
             try:
                 made = engine(name, size, batch=batch)
             except NotMeasured as reason:
                 yield f"{name}/{batch}", f"not measured: {reason}"
                 continue
-            for what, value in _rates(made, size, batch, tables):
+            for what, value in _rates(made, size, batch):
                 best[name] = max(best.get(name, 0.0), value if what == "scene_seconds" else 0.0)
                 yield f"{what}/{name}/{batch}", value
         yield "", max(best.get(name, 0.0) for name in ACCELERATORS) / best["native"]
 
 
-def _rates(
-    engine: Engine, size: Size, batch: int, tables: Callable[[], tuple[Scene, np.ndarray, Push]]
-) -> Iterator[tuple[str, float]]:
+def _rates(engine: Engine, size: Size, batch: int) -> Iterator[tuple[str, float]]:
     """Measure an engine's scene seconds, drops and pushes a second, in a batch."""
-    scene, poses = heaps(size.seed, batch, objects=size.objects)
+    scene, poses = heaps_of(size, batch)
     begun = seconds(lambda: make_ready(engine, scene, poses))
     yield "first_call_seconds", begun
     yield "scene_seconds", heap_rate(engine, scene, poses, size)
     scene, poses = drawn(size, batch)
     dropping = functools.partial(primitives.settle, engine, scene, poses, fence=primitives.FENCE_TIME)
     yield "drops_per_second", batch / seconds(dropping)
-    scene, poses, pushes = tables()
+    scene, poses, pushes = _tables(size, batch)
     yield "pushes_per_second", batch / seconds(lambda: primitives.push(engine, scene, poses, pushes))
 
 
@@ -185,6 +189,7 @@ def heap_rate(engine: Engine, scene: Scene, poses: np.ndarray, size: Size) -> fl
     return len(poses) * size.heap_seconds / statistics.median(taken)
 
 
+@functools.cache
 def _tables(size: Size, batch: int) -> tuple[Scene, np.ndarray, Push]:
     """Return `batch` scenes at rest in MuJoCo C and a feasible push on each; some are there more than once."""
     scene, poses = drawn(size, batch)

@@ -10,8 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.datagen_mjx import heaps
-from benchmarks.gpu_engines import ACCELERATORS, engine, make_ready
+from benchmarks.gpu_engines import ACCELERATORS, engine, heaps_of, make_ready
 from benchmarks.gpu_stage import Found, NotMeasured, Size
 from dipn_jax.physics import CONTROL_PERIOD
 from dipn_jax.world import primitives
@@ -33,7 +32,7 @@ def profile(size: Size) -> Found:
       NotMeasured: no profile shows kernels of a device.
     """
     batch, seen = size.batches[0], False
-    scene, poses = heaps(size.seed, batch, objects=size.objects)
+    scene, poses = heaps_of(size, batch)
     for name in ACCELERATORS:
         try:
             made = engine(name, size)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.datagen_mjx import heaps
-from benchmarks.gpu_engines import heap_rate, make_ready
+from benchmarks.gpu_engines import heap_rate, heaps_of, make_ready
 from benchmarks.gpu_stage import Found, NotMeasured, Size, brief, installed
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
@@ -81,7 +80,7 @@ def iterations(engine: Engine) -> dict[str, float]:
 def variants(size: Size) -> Found:
     """Measure each variant on falling heaps: scene seconds a second, scenes with a fault, iterations of its solver."""
     batch = size.batches[0]
-    scene, poses = heaps(size.seed, batch, objects=size.objects)
+    scene, poses = heaps_of(size, batch)
     still, end = primitives.parked_trajectory(batch, size.heap_seconds), np.array([size.heap_seconds])
     rates: dict[str, float] = {}
     for name in [*list(WARP)[: size.variants], *list(MJX)[: size.variants]]:

@@ -32,7 +32,8 @@ import json, os, sys, time
 def say(**answer):
     print(json.dumps(answer), flush=True)
 
-say(machine={"processor": "p", "cores": 2, "devices": ["d"], "python": "3", "versions": {}, "commit": "c"})
+device = os.environ.get("DEVICE", "d")
+say(machine={"processor": "p", "cores": 2, "devices": [device], "python": "3", "versions": {}, "commit": "c"})
 for line in sys.stdin:
     name = json.loads(line)["stage"]
     with open(os.environ["ASKED"], "a") as asked:
@@ -130,6 +131,20 @@ def test_a_rehearsal_is_not_continued_on_a_gpu(
     assert on_gpu.main(["--out", str(tmp_path / "a.json"), "--toy"]) == 0
     assert on_gpu.main(["--out", str(tmp_path / "a.json")]) == 2
     assert "begun with scale toy, asked for full; give another --out" in capsys.readouterr().err
+
+
+def test_without_a_gpu_only_a_rehearsal_begins(
+    stages: Callable[..., list[str]],
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stages("good")
+    monkeypatch.setenv("DEVICE", "cpu")
+    assert on_gpu.main(["--out", str(tmp_path / "a.json")]) == 2
+    assert capsys.readouterr().err.startswith("error: on_gpu: JAX finds no GPU here; ")
+    assert not (tmp_path / "a.json").exists()
+    assert on_gpu.main(["--out", str(tmp_path / "a.json"), "--toy"]) == 0
 
 
 def _measured(work: Callable[[Any], Iterator[Any]], seconds: float, monkeypatch: pytest.MonkeyPatch) -> tuple[str, Any]:
