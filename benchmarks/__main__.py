@@ -39,6 +39,9 @@ BENCHMARKS = {
         "none",
         "mjx_settings:settings",
     ),
+    "datagen.encoding": Benchmark(
+        "push episodes a second that are encoded and written, physics not counted", ">= 5000", "encoding:encoding"
+    ),
     "render.vs_raycast": Benchmark("images a second over MuJoCo's ray caster", ">= 20", "rendering:vs_raycast"),
     "storage.vs_images": Benchmark("bytes of a push over PNGs of its frames", "<= 0.01", "storage:vs_images"),
     "compile.warm_over_cold": Benchmark(

@@ -64,18 +64,22 @@ def _scoring(setting: Setting, preset: str, count: int) -> Iterator[tuple[str, f
     yield f"{figure}/torch_milliseconds", 1000 * theirs
 
 
+def training_examples(preset: str, batch: int, seed: int) -> dict[str, np.ndarray]:
+    """Return the images `[B, W, W, 4]`, pixels `[B, 2]` and outcomes `[B]` of a training step, by their names."""
+    wide, side = np.pad(_image(seed), [(48, 48), (48, 48), (0, 0)]), BATCHES[preset][1]
+    begin = (wide.shape[0] - side) // 2
+    images = np.repeat(wide[None, begin : begin + side, begin : begin + side], batch, 0)
+    success = (np.arange(batch) % 2).astype(np.float32)
+    return {"images": images, "pixel": np.full((batch, 2), side // 2), "success": success}
+
+
 def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
     """Measure samples per second of a training step over those in PyTorch, and our peak memory over PyTorch's."""
     _need_torch()
-    image = _image(setting.seed)
-    for preset, (batch, side) in BATCHES.items():
-        wide = np.pad(image, [(48, 48), (48, 48), (0, 0)])
-        begin = (wide.shape[0] - side) // 2
-        images = np.repeat(wide[None, begin : begin + side, begin : begin + side], batch, 0)
+    for preset, (batch, _) in BATCHES.items():
         with tempfile.TemporaryDirectory() as name:
             file = pathlib.Path(name) / "examples.npz"
-            success = (np.arange(batch) % 2).astype(np.float32)
-            np.savez(file, allow_pickle=False, images=images, pixel=np.full((batch, 2), side // 2), success=success)
+            np.savez(file, allow_pickle=False, **training_examples(preset, batch, setting.seed))
             count = 1 if preset == "paper" else setting.pick(5, 20)
             figure, arguments = f"bench_grasp.vs_torch/{preset}", (preset, "train", file)
             yield from versus(figure, "grasp_worker", arguments, batch=batch, count=count, repeats=setting.pick(3, 9))

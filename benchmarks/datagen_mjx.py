@@ -37,14 +37,14 @@ def engine() -> MjxEngine:
     return made
 
 
-def heaps(seed: int, batch: int) -> tuple[Scene, np.ndarray]:
+def heaps(seed: int, batch: int, *, objects: int = OBJECTS) -> tuple[Scene, np.ndarray]:
     """Return one random scene `batch` times, and poses `[batch, N, 7]` of a different heap of it in each."""
     key = jax.random.key(seed)
-    scene, poses = scenes.random_scene(key, config=scenes.fixed_count(OBJECTS))
+    scene, poses = scenes.random_scene(key, config=scenes.fixed_count(objects))
     repeated = structs.take(jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene), np.zeros(batch, int))
     start = np.tile(np.asarray(poses), (batch, 1, 1))
     # objects start between the bounding spheres of one another, so they may be turned at will
-    start[..., 3:] = np.asarray(geometry.random_quat(jax.random.fold_in(key, 1), shape=(batch, OBJECTS)))
+    start[..., 3:] = np.asarray(geometry.random_quat(jax.random.fold_in(key, 1), shape=(batch, objects)))
     rollout = primitives.settle(make_engine("native"), repeated, start, duration=FALL_SECONDS)
     return repeated, np.asarray(rollout.poses)[:, -1]
 

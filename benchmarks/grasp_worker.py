@@ -1,7 +1,8 @@
 """Train GN, or score an image with it, in one framework, in a process of its own.
 
-`python -m benchmarks.grasp_worker FRAMEWORK PRESET train|score FILE.npz`: `images [B, W, W, 4]` and `pixel [B, 2]` and
-`success [B]`, or `image [224, 224, 4]`, are in the file. See `benchmarks.worker` for what it reads and answers.
+`python -m benchmarks.grasp_worker FRAMEWORK PRESET train|score FILE.npz [PRECISION]`: `images [B, W, W, 4]`,
+`pixel [B, 2]` and `success [B]`, or `image [224, 224, 4]`, are in the file. See `benchmarks.worker` for what it reads
+and answers.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks import worker
-from benchmarks.worker import MOMENTUM, RATE, Step
+from benchmarks.worker import FLOAT32, Step
 from dipn_jax.networks.grasp import GraspConfig
 
 
-def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
+def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray], precision: str = FLOAT32) -> tuple[Step, int]:
     """Return one step of SGD with momentum, or all scores of an image, in JAX; and the number of parameters."""
     import jax
     import jax.numpy as jnp
+    from dipn_jax.train.precision import compute_in
     from flax import nnx
 
     from dipn_jax.networks import losses
@@ -27,6 +29,7 @@ def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Ste
     from dipn_jax.storage import checkpoint
 
     model: Any = checkpoint.build("grasp", GraspConfig(preset=preset))
+    compute_in(model, precision)
     if work == "score":
         model.eval()
         parameters = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
@@ -41,45 +44,44 @@ def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Ste
     return worker.sgd(model, loss)
 
 
-def torch_step(preset: str, work: str, arrays: dict[str, np.ndarray]) -> tuple[Step, int]:
+def torch_step(preset: str, work: str, arrays: dict[str, np.ndarray], precision: str = FLOAT32) -> tuple[Step, int]:
     """Return the same step in PyTorch."""
     import torch
 
     from benchmarks import torch_grasp
-    from dipn_jax.physics import cores
 
-    torch.set_num_threads(cores())
-    made: Any = {"paper": torch_grasp.Paper, "compact": torch_grasp.Compact}[preset](GraspConfig(preset=preset))
+    device = worker.torch_device()
+    kind: Any = {"paper": torch_grasp.Paper, "compact": torch_grasp.Compact}[preset]
+    made = kind(GraspConfig(preset=preset)).to(device)
     parameters = sum(each.numel() for each in made.parameters())
     if work == "score":
         made.eval()
-        image = torch.from_numpy(arrays["image"].transpose(2, 0, 1).copy())
+        image = torch.from_numpy(arrays["image"].transpose(2, 0, 1).copy()).to(device)
 
         def score() -> None:
             with torch.inference_mode():
                 torch_grasp.score(made, image)
+            worker.wait_for(device)
 
         return score, parameters
-    images = torch.from_numpy(arrays["images"].transpose(0, 3, 1, 2).copy())
-    row, col = torch.from_numpy(arrays["pixel"].T.copy()).long()
-    success = torch.from_numpy(arrays["success"])
-    optimizer = torch.optim.SGD(made.parameters(), RATE, MOMENTUM)
+    images = torch.from_numpy(arrays["images"].transpose(0, 3, 1, 2).copy()).to(device)
+    row, col = torch.from_numpy(arrays["pixel"].T.copy()).long().to(device)
+    success = torch.from_numpy(arrays["success"]).to(device)
 
-    def run() -> None:
-        optimizer.zero_grad()
+    def loss() -> Any:
         logits = made(images)[torch.arange(len(images)), row, col]
-        torch.nn.functional.binary_cross_entropy_with_logits(logits, success).backward()
-        optimizer.step()
+        return torch.nn.functional.binary_cross_entropy_with_logits(logits, success)
 
-    return run, parameters
+    run = worker.torch_sgd(made, loss, device=device, precision=precision)
+    return run, sum(each.numel() for each in made.parameters())
 
 
 def main() -> None:
     """Run a worker."""
-    framework, preset, work, file = sys.argv[1:]
+    framework, preset, work, file, *precision = sys.argv[1:]
     with np.load(file, allow_pickle=False) as stored:
         arrays = dict(stored)
-    worker.serve(*{"jax": jax_step, "torch": torch_step}[framework](preset, work, arrays))
+    worker.serve(*{"jax": jax_step, "torch": torch_step}[framework](preset, work, arrays, *precision))
 
 
 if __name__ == "__main__":

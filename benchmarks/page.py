@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
 from benchmarks.harness import Figures
 from dipn_jax import console, files
@@ -23,11 +24,13 @@ def _row(cells: Sequence[str]) -> str:
 
 def tables(figures: Figures) -> str:
     """Return as Markdown ratios with their goals, episodes per second, and the cost of other settings of MJX."""
+    goals = {known: benchmark.goal for known, benchmark in BENCHMARKS.items()}
+    goals |= {known: stage.goal for known, stage in on_gpu.STAGES.items()}
     ratios = [_row(["figure", "goal", "value"]), _row(["---"] * 3)]
     rates: dict[str, dict[int, float]] = {}
     variants: dict[str, dict[str, float]] = {}
     for name, value in figures.items():
-        base = next(known for known in BENCHMARKS if name == known or name.startswith((f"{known}/", f"{known}.")))
+        base = next(known for known in goals if name == known or name.startswith((f"{known}/", f"{known}.")))
         if base == SETTINGS:
             _, variant, key = name.split("/")
             variants.setdefault(variant, {})[key] = value
@@ -36,7 +39,7 @@ def tables(figures: Figures) -> str:
             rates.setdefault(kind.replace("/", ", "), {})[int(count)] = value
         else:
             plain = name == base or name.rpartition("/")[2].isdigit()
-            ratios.append(_row([f"`{name}`", BENCHMARKS[base].goal if plain else "", f"{value:.3g}"]))
+            ratios.append(_row([f"`{name}`", goals[base] if plain else "", f"{value:.3g}"]))
     counts = sorted({count for row in rates.values() for count in row})
     speeds = [_row(["episodes a second", *map(str, counts)]), _row(["---"] * (len(counts) + 1))]
     for kind, row in rates.items():

@@ -38,7 +38,7 @@ USES = 64
 """Number of times that a training of 3,000 steps uses each of 1,500 pushes."""
 
 
-def small_task(folder: str, preset: str, seed: int) -> PushTask:
+def small_task(folder: str, preset: str, seed: int, *, episodes: int = 72) -> PushTask:
     """Return a training task on a small data set of 1 to 7 objects."""
     data = pathlib.Path(folder) / "data"
     with quiet():
@@ -46,9 +46,9 @@ def small_task(folder: str, preset: str, seed: int) -> PushTask:
             Job(
                 kind="push",
                 scene=scenes.parse_objects("paper"),
-                episodes=72,
+                episodes=episodes,
                 seed=seed,
-                shard_size=72,
+                shard_size=episodes,
                 actions=3,
                 engine="native",
             ),
@@ -57,17 +57,23 @@ def small_task(folder: str, preset: str, seed: int) -> PushTask:
     return PushTask(data, DipnConfig(preset=preset), limit=None, centimetres=tuple(range(1, 11)))
 
 
+def training_examples(preset: str, batch: int, seed: int, *, episodes: int = 72) -> dict[str, np.ndarray]:
+    """Return the inputs `[B, ...]` and the target `[B, N, 10, 3]` of a training step, by their names."""
+    with tempfile.TemporaryDirectory() as name:
+        task = small_task(name, preset, seed, episodes=episodes)
+        examples = task.prepare(structs.take(task.train_set, np.arange(batch)))
+    arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
+    return {"target": np.asarray(examples.target), **arrays}
+
+
 def vs_torch(setting: Setting) -> Iterator[tuple[str, float]]:
     """Measure seconds of a training step in PyTorch over ours, and our peak memory over PyTorch's."""
     if importlib.util.find_spec("torch") is None:
         raise Skipped("PyTorch is not installed; run pip install torch (the extra `bench`)")
     for preset, batch in BATCHES.items():
         with tempfile.TemporaryDirectory() as name:
-            task = small_task(name, preset, setting.seed)
-            examples = task.prepare(structs.take(task.train_set, np.arange(batch)))
-            arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
             file = pathlib.Path(name) / "examples.npz"
-            np.savez(file, allow_pickle=False, target=np.asarray(examples.target), **arrays)
+            np.savez(file, allow_pickle=False, **training_examples(preset, batch, setting.seed))
             count = 1 if preset == "paper" else setting.pick(10, 40)
             figure, arguments = f"push_net.vs_torch/{preset}", (preset, batch, file)
             yield from versus(figure, "push_worker", arguments, batch=batch, count=count, repeats=setting.pick(3, 9))

@@ -73,8 +73,14 @@ def _same(ours: Observation, theirs: Observation) -> None:
 
 def vs_raycast(setting: Setting) -> Iterator[tuple[str, float]]:
     """Measure seconds of the ray caster over seconds of the renderer."""
-    key = jax.random.key(setting.seed)
-    items = clutter.settled_scenes(key, make_engine("native"), scenes.fixed_count(OBJECTS), BATCH)
+    mine, theirs = times(setting.seed, BATCH, repeats=setting.pick(5, 15))
+    yield "render.vs_raycast", theirs / mine
+
+
+def times(seed: int, batch: int, *, repeats: int, objects: int = OBJECTS) -> tuple[float, float]:
+    """Measure seconds of the renderer and of the ray caster for images of `batch` scenes."""
+    key = jax.random.key(seed)
+    items = clutter.settled_scenes(key, make_engine("native"), scenes.fixed_count(objects), batch)
     caster = RayCaster(items)
     scene: Scene = jax.tree.map(jax.numpy.asarray, items.scene)
     poses = jax.numpy.asarray(items.poses)
@@ -85,5 +91,5 @@ def vs_raycast(setting: Setting) -> Iterator[tuple[str, float]]:
         for _ in range(inner):
             jax.block_until_ready(render.observe(scene, poses))
 
-    mine, theirs = alternate(ours, caster.observe, repeats=setting.pick(5, 15))
-    yield "render.vs_raycast", theirs / (mine / inner)
+    mine, theirs = alternate(ours, caster.observe, repeats=repeats)
+    return mine / inner, theirs

@@ -94,6 +94,6 @@ def rotate(images: Tensor, angles: Tensor, size: int) -> Tensor:
 
 def score(network: nn.Module, image: Tensor) -> Tensor:
     """Return scores `[16, 224, 224]` of an image `[4, 224, 224]` whose table is 0, as `grasp.score_image` does."""
-    angles = torch.from_numpy(grasp_angles())
+    angles = torch.from_numpy(grasp_angles()).to(image.device)
     views = rotate(image.expand(ROTATIONS, *image.shape), angles, VIEW_PIXELS)
     return rotate(torch.sigmoid(network(views))[:, None], -angles, WORKSPACE.pixels)[:, 0]

@@ -73,6 +73,8 @@ class Paper(nn.Module):
         self.push, self.center = mlp(4, (8, 16)), mlp(2, (8, 16))
         self.direct, self.pair = mlp(96, (128, 128)), mlp(176, (128, 128, 128))
         self.motion = mlp(640, (256, 64, 32, 16, 3), linear_end=True)
+        end = np.array(push_frame.push_ends(jnp.float32(PUSH_STEPS * 0.01)))
+        self.register_buffer("end", torch.from_numpy(end), persistent=False)
 
     def forward(self, inputs: Inputs) -> Tensor:
         """Motions `[B, N, 1, 3]` after the longest push."""
@@ -80,8 +82,7 @@ class Paper(nn.Module):
         scene = self.scene_out(self.scene(torch.stack([inputs["push_map"], inputs["scene_map"]], 1)))
         crop = self.item_out(self.item(inputs["crops"].flatten(0, 1).movedim(-1, 1))).unflatten(0, (b, n))
         item = torch.cat([crop, self.center(inputs["centers"] / (WORKSPACE.half / 2))], -1)
-        end = torch.from_numpy(np.array(push_frame.push_ends(jnp.float32(PUSH_STEPS * 0.01))))
-        push = self.push(end).expand(b, n, -1)
+        push = self.push(self.end).expand(b, n, -1)
         pairs = [push[:, :, None].expand(-1, -1, n, -1), item[:, :, None].expand(-1, -1, n, -1),
                  item[:, None].expand(-1, n, -1, -1)]  # fmt: skip
         total = self.direct(torch.cat([push, item], -1))

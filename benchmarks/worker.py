@@ -19,6 +19,8 @@ MOMENTUM = 0.9
 """Momentum of SGD."""
 Step = Callable[[], None]
 """Takes one step, and returns when it is done."""
+FLOAT32 = "float32"
+"""The precision of `train.precision` that networks compute in unless another is given."""
 
 
 def serve(step: Step, parameters: int) -> None:
@@ -57,6 +59,49 @@ def sgd(model: Any, loss: Callable[[Any], Any]) -> tuple[Step, int]:
         value.block_until_ready()
 
     return run, sum(leaf.size for leaf in jax.tree.leaves(params))
+
+
+def torch_device() -> Any:
+    """Return the device that PyTorch computes on, a GPU where it has one, and make new tensors there.
+
+    Products of matrices are then as precise as JAX's are there: TF32, as those of convolutions in both.
+    """
+    import torch
+
+    from dipn_jax.machine import cores
+
+    torch.set_num_threads(cores())
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if device.type == "cuda":
+        torch.set_default_device(device)
+        torch.set_float32_matmul_precision("high")
+    return device
+
+
+def torch_sgd(model: Any, loss: Callable[[], Any], *, device: Any, precision: str) -> Step:
+    """Return a step of SGD with momentum on `loss` of a network in PyTorch."""
+    import torch
+
+    optimizer = torch.optim.SGD(model.parameters(), RATE, MOMENTUM)
+    lower = precision != FLOAT32
+
+    def run() -> None:
+        optimizer.zero_grad()
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=lower):
+            value = loss()
+        value.backward()
+        optimizer.step()
+        wait_for(device)
+
+    return run
+
+
+def wait_for(device: Any) -> None:
+    """Wait until PyTorch has done all work on a device."""
+    import torch
+
+    if device.type == "cuda":
+        torch.cuda.synchronize()
 
 
 def peak_memory() -> float:

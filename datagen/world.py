@@ -118,10 +118,17 @@ def isolated_grasps(engine: Engine, seed: int, tries: int) -> Metrics:
     return found
 
 
-def trial(key: jax.Array, engine: Engine, count: int) -> Trial:
-    """Draw `count` scenes of 1 to 7 objects, each with a random feasible push and GRASPS_PER_SCENE random grasps."""
+def trial(key: jax.Array, engine: Engine, count: int, *, config: scenes.SceneConfig | None = None) -> Trial:
+    """Draw `count` scenes, each with a random feasible push and GRASPS_PER_SCENE random grasps.
+
+    Args:
+      key: random key.
+      engine: that they come to rest in.
+      count: of scenes; fewer if pushes are feasible on less than half of those that are drawn.
+      config: of the scenes; 1 to 7 objects if not given.
+    """
     drop, aim = jax.random.split(key)
-    items = clutter.settled_scenes(drop, engine, scenes.SceneConfig(), max(2 * count, 8))
+    items = clutter.settled_scenes(drop, engine, config or scenes.SceneConfig(), max(2 * count, 8))
     keys = jax.random.split(aim, len(items.fault))
     pushes, feasible = episodes.aim_pushes(keys, items.scene, items.poses, actions=1)
     grasps = episodes.aim_grasps(keys, items.scene, items.poses, actions=GRASPS_PER_SCENE)

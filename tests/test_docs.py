@@ -17,6 +17,7 @@ import tyro
 from dipn_jax.datagen.exporting.export import NEEDS
 from dipn_jax.eval.report import paper
 
+from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
 from dipn_jax import console, files
 from dipn_jax.sight import render
@@ -107,6 +108,10 @@ def test_commands_on_pages_exist(page: pathlib.Path, capfd: pytest.CaptureFixtur
                 assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in named), words
             case ["python", "-m", "benchmarks", *names]:
                 assert all(name in BENCHMARKS for name in names), words
+            case ["python", "-m", "benchmarks.on_gpu", *options]:
+                on_gpu.parser().parse_args(options)
+            case ["pip", command, *_]:
+                assert command in ("download", "install"), words
             case ["python", "-m", "pytest", *options]:
                 assert all((ROOT / option).exists() for option in options if option.endswith(".py")), words
             case ["python", "-m", "experiments.moving_picture", *options]:
