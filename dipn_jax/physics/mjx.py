@@ -20,7 +20,7 @@ from jaxtyping import Float
 from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.errors import UserError
-from dipn_jax.physics import kept, patches
+from dipn_jax.physics import blocks, kept, patches
 from dipn_jax.physics.mjx_program import Program
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
@@ -57,9 +57,12 @@ class MjxEngine:
           devices: devices that share every chunk; all local ones if not given. A power of two of them are used.
 
         Raises:
-          UserError: the control period is not a whole number of time steps, or `chunk` is no power of two.
+          UserError: the control period is not a whole number of time steps, `chunk` is no power of two, or the Warp
+            solver is asked for and cannot be used here.
         """
         self.substeps = physics.substeps(config)
+        if config.solver == "warp":
+            blocks.load()
         patches.register()
         self.config = config
         local = list(devices or jax.local_devices())
@@ -109,7 +112,8 @@ class MjxEngine:
         if key not in self.programs:
             made = Program(self.config, slots, self.substeps)
             alone = len(self.devices) == 1 and self.devices[0].platform == jax.default_backend()
-            self.programs[key] = self._kept(made, arguments) if alone else self._shared(made)
+            kept_on_disk = alone and self.config.solver == "xla"  # a call of Warp is of this process
+            self.programs[key] = self._kept(made, arguments) if kept_on_disk else self._shared(made)
         return self.programs[key]
 
     def _shared(self, made: Program) -> Callable[..., Rollout]:
