@@ -28,6 +28,11 @@ SIZE = 6
 """Degrees of freedom of a block."""
 CAPACITIES = ((8, 80), (15, 112))
 """Blocks and contacts of a scene that there are kernels for: 7 objects, and the most whose shared memory is static."""
+ARGUMENTS = (
+    *("mass", "force", "free", "velocity", "center", "axes", "row", "row_goal", "row_weight"),
+    *("position", "frame", "side", "scale", "stiffness", "damping", "bias"),
+)
+"""Fields of a problem in the order of the kernel's first arguments; then comes the acceleration to begin from."""
 
 
 @flax.struct.dataclass
@@ -116,10 +121,8 @@ def minimize(p: Problem, start: Float[Array, " V"], iterations: int, line: int) 
         output_dims={"acceleration": SIZE * blocks, "steps": 1},
         block_dim=native.LANES,
     )
-    vectors = (p.mass, p.force, p.free, p.velocity, start, p.center, p.axes, p.row, p.row_goal, p.row_weight)
-    points = (p.position, p.frame, p.side, p.scale, p.stiffness, p.damping, p.bias)
-    flat = [jnp.asarray(leaf).reshape(-1) for leaf in (*vectors, *points)]
-    acceleration, steps = call(*flat, blocks, contacts, rows, p.equalities, iterations, line)
+    flat = [jnp.asarray(getattr(p, name)).reshape(-1) for name in ARGUMENTS]
+    acceleration, steps = call(*flat, start, blocks, contacts, rows, p.equalities, iterations, line)
     return acceleration, steps
 
 

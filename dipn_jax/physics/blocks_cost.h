@@ -9,6 +9,9 @@
 // Python puts in front of this text: BLOCKS, CONTACTS, ROWS (capacities), and TOLERANCE, FLAT, NARROW, FIRST, STRETCH
 // and TINY (see `cone.py`).
 
+// A loop that the lanes share; not unrolled, for a kernel of few registers that fits a GPU's instruction cache.
+#define SHARE(i, from, to) WP_PRAGMA_NO_UNROLL for (int i = (from) + lane; i < (to); i += LANES)
+
 enum { SIX = 6, SQUARE = 36, NONE = BLOCKS, DOF = SIX * (BLOCKS + 1), LANES = WP_TILE_BLOCK_DIM };
 
 // What the lanes share. The last block of vectors is always zero: it is what a contact with the table moves.
@@ -154,16 +157,16 @@ struct Terms {
     {
         sync();
         float cost = 0.0f;
-        for (int i = lane; i < dof; i += LANES) {
+        SHARE(i, 0, dof) {
             s.lack[i] = mass_product(i, s.at) - force[i];
             cost += s.lack[i] * (s.at[i] - free[i]);
         }
-        for (int r = lane; r < rows; r += LANES) {
+        SHARE(r, 0, rows) {
             s.x[r] = row_product(r, s.at) - s.row_goal[r];
             s.pushing[r] = r < equalities || s.x[r] < 0.0f ? s.row_weight[r] : 0.0f;
             cost += s.pushing[r] * s.x[r] * s.x[r];
         }
-        for (int c = lane; c < s.count; c += LANES) {
+        SHARE(c, 0, s.count) {
             for (int k = 0; k < 3; ++k)
                 s.u[c][k] = product(c, k, s.at) - s.goal[c][k];
             const Reach reach(s.u[c], s.mu[c]);
@@ -183,8 +186,9 @@ struct Terms {
     // Put gradient and Hessian together, contact by contact, so that no two lanes add to the same number.
     CUDA_CALLABLE void assemble() const
     {
-        for (int i = lane; i < dof; i += LANES) {
+        SHARE(i, 0, dof) {
             const int b = i / SIX;
+            WP_PRAGMA_NO_UNROLL
             for (int j = 0; j <= b; ++j)
                 if (has(b, j))
                     for (int q = 0; q < SIX; ++q)
@@ -204,7 +208,7 @@ struct Terms {
             if (b[0] == 0.0f)  // it does not push
                 continue;
             const int high = s.side[0][c], low = s.side[1][c], columns = low == NONE ? SIX : 2 * SIX;
-            for (int col = lane; col < columns; col += LANES) {
+            SHARE(col, 0, columns) {
                 const int which = col / SIX, q = col % SIX;
                 float j[3], pull = 0.0f;
                 for (int k = 0; k < 3; ++k) {
@@ -218,7 +222,7 @@ struct Terms {
                 s.gradient[SIX * s.side[which][c] + q] += pull;
             }
             sync();
-            for (int task = lane; task < (low == NONE ? SIX : 3 * SIX); task += LANES) {
+            SHARE(task, 0, low == NONE ? SIX : 3 * SIX) {
                 const int part = task / SIX, r = task % SIX;  // blocks (high, high), (high, low), (low, low)
                 const int from = part == 2 ? SIX : 0, to = part ? SIX : 0;
                 float* target = block(part == 2 ? low : high, part ? low : high) + SIX * r;

@@ -42,34 +42,35 @@ def kernel(blocks: int, contacts: int) -> Any:
 
     It is launched with `LANES` threads a scene and blocks of that size. Arrays are flat, scene after scene:
 
-    - `mass [blocks, 6, 6]`, `force`, `free`, `velocity` and `start [blocks, 6]`: see `blocks.Problem`;
+    - `mass [blocks, 6, 6]`, `force`, `free` and `velocity [blocks, 6]`: see `blocks.Problem`;
     - `center [blocks, 3]` and `axes [blocks, 3, 6]`;
     - `row [rows, 6]`, `row_goal` and `row_weight [rows]`, the first `equalities` of them two-sided;
     - `position [contacts, 3]`, `frame [contacts, 3, 3]`, `side [contacts, 2]`, `scale [contacts, 3]`, `stiffness`,
       `damping` and `bias [contacts]`;
+    - `start [blocks, 6]`: an acceleration to begin from, where it costs less than `free`;
     - out: `acceleration [blocks, 6]`, `steps` (of Newton's).
     """
     floats, integers = wp.array(dtype=wp.float32), wp.array(dtype=wp.int32)
 
     @wp.func_native(_source(blocks, contacts))
     def solve_scene(
-        mass: floats, force: floats, free: floats, velocity: floats, start: floats, center: floats, axes: floats,
-        row: floats, row_goal: floats, row_weight: floats, position: floats, frame: floats, side: integers,
-        scale: floats, stiffness: floats, damping: floats, bias: floats, blocks: int, contacts: int, rows: int,
+        mass: floats, force: floats, free: floats, velocity: floats, center: floats, axes: floats, row: floats,
+        row_goal: floats, row_weight: floats, position: floats, frame: floats, side: integers, scale: floats,
+        stiffness: floats, damping: floats, bias: floats, start: floats, blocks: int, contacts: int, rows: int,
         equalities: int, iterations: int, limit: int, acceleration: floats, steps: integers, scene: int, lane: int,
     ): ...  # fmt: skip
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
     def solve(
-        mass: floats, force: floats, free: floats, velocity: floats, start: floats, center: floats, axes: floats,
-        row: floats, row_goal: floats, row_weight: floats, position: floats, frame: floats, side: integers,
-        scale: floats, stiffness: floats, damping: floats, bias: floats, blocks: int, contacts: int, rows: int,
+        mass: floats, force: floats, free: floats, velocity: floats, center: floats, axes: floats, row: floats,
+        row_goal: floats, row_weight: floats, position: floats, frame: floats, side: integers, scale: floats,
+        stiffness: floats, damping: floats, bias: floats, start: floats, blocks: int, contacts: int, rows: int,
         equalities: int, iterations: int, limit: int, acceleration: floats, steps: integers,
     ):  # fmt: skip
         scene, lane = wp.tid()
         solve_scene(
-            mass, force, free, velocity, start, center, axes, row, row_goal, row_weight, position, frame, side, scale,
-            stiffness, damping, bias, blocks, contacts, rows, equalities, iterations, limit, acceleration, steps,
+            mass, force, free, velocity, center, axes, row, row_goal, row_weight, position, frame, side, scale,
+            stiffness, damping, bias, start, blocks, contacts, rows, equalities, iterations, limit, acceleration, steps,
             scene, lane,
         )  # fmt: skip
 

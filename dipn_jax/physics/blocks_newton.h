@@ -5,13 +5,14 @@ struct Newton : Terms {
     // Subtract from the rows of column j what the columns before it explain.
     CUDA_CALLABLE void reduce(int j) const
     {
-        for (int i = SIX * j + lane; i < dof; i += LANES) {
+        SHARE(i, SIX * j, dof) {
             const int b = i / SIX, r = SIX * (i % SIX);
             if (!has(b, j))
                 continue;
             float x[SIX];
             for (int p = 0; p < SIX; ++p)
                 x[p] = block(b, j)[r + p];
+            WP_PRAGMA_NO_UNROLL
             for (int k = 0; k < j; ++k) {
                 if (!(has(b, k) && has(j, k)))
                     continue;
@@ -31,7 +32,7 @@ struct Newton : Terms {
     // Factor the Hessian and solve for Newton's step, block column by block column.
     CUDA_CALLABLE void solve() const
     {
-        for (int i = lane; i < dof; i += LANES)
+        SHARE(i, 0, dof)
             s.step[i] = -s.gradient[i];
         for (int j = 0; j < blocks; ++j) {
             reduce(j);
@@ -50,7 +51,7 @@ struct Newton : Terms {
                 }
             }
             sync();
-            for (int i = SIX * (j + 1) + lane; i < dof; i += LANES) {
+            SHARE(i, SIX * (j + 1), dof) {
                 if (!has(i / SIX, j))
                     continue;
                 float *row = block(i / SIX, j) + SIX * (i % SIX), known = 0.0f, x[SIX];
@@ -94,7 +95,7 @@ struct Newton : Terms {
             z[p] *= block(j, j)[(SIX + 1) * p];
         }
         sync();
-        for (int i = lane; i < SIX * j; i += LANES)
+        SHARE(i, 0, SIX * j)
             if (has(j, i / SIX)) {
                 float known = 0.0f;
                 for (int q = 0; q < SIX; ++q)
@@ -111,13 +112,13 @@ struct Newton : Terms {
     CUDA_CALLABLE void slopes(float t, float slope, float bend, float& first, float& second) const
     {
         float one = 0.0f, two = 0.0f;
-        for (int r = lane; r < rows; r += LANES) {
+        SHARE(r, 0, rows) {
             const float x = s.x[r] + t * s.dx[r];
             const float push = r < equalities || x < 0.0f ? s.row_weight[r] : 0.0f;
             one += push * x * s.dx[r];
             two += push * s.dx[r] * s.dx[r];
         }
-        for (int c = lane; c < s.count; c += LANES) {
+        SHARE(c, 0, s.count) {
             const float* du = s.du[c];
             const float u[3] = { s.u[c][0] + t * du[0], s.u[c][1] + t * du[1], s.u[c][2] + t * du[2] };
             const Reach reach(u, s.mu[c]);
@@ -132,13 +133,13 @@ struct Newton : Terms {
     CUDA_CALLABLE float search(float begin, int limit) const
     {
         float slope = 0.0f, bend = 0.0f;
-        for (int i = lane; i < dof; i += LANES) {
+        SHARE(i, 0, dof) {
             slope += s.lack[i] * s.step[i];
             bend += mass_product(i, s.step) * s.step[i];
         }
-        for (int r = lane; r < rows; r += LANES)
+        SHARE(r, 0, rows)
             s.dx[r] = row_product(r, s.step);
-        for (int c = lane; c < s.count; c += LANES)
+        SHARE(c, 0, s.count)
             for (int k = 0; k < 3; ++k)
                 s.du[c][k] = product(c, k, s.step);
         slope = sum(slope);
@@ -168,24 +169,43 @@ struct Newton : Terms {
         return low;  // the cost falls all the way to it
     }
 
-    // Move `s.at` to the least cost; return the number of Newton's steps.
-    CUDA_CALLABLE int minimize(int iterations, int limit) const
+    CUDA_CALLABLE void begin(const float* acceleration) const
     {
-        for (int count = 0; count < iterations; ++count) {
+        SHARE(i, 0, dof)
+            s.at[i] = acceleration[i];
+    }
+
+    // Move `s.at` to the least cost, from `start` or from `free`, where it is less; return the number of Newton's steps.
+    CUDA_CALLABLE int minimize(const float* start, int iterations, int limit) const
+    {
+        float known = 0.0f;
+        int count = 0;
+        begin(free);
+        for (int look = 0; count < iterations; ++look) {
             const float cost = evaluate();
+            if (look == 0) {
+                known = cost;
+                begin(start);
+                continue;
+            }
+            if (look == 1 && !(cost < known)) {
+                begin(free);
+                continue;
+            }
             assemble();
             solve();
             float slope = 0.0f;
-            for (int i = lane; i < dof; i += LANES)
+            SHARE(i, 0, dof)
                 slope += s.gradient[i] * s.step[i];
             slope = sum(slope);
             const float t = slope < 0.0f ? search(slope, limit) : 0.0f;
-            for (int i = lane; i < dof; i += LANES)
+            SHARE(i, 0, dof)
                 s.at[i] += t * s.step[i];
+            ++count;
             if (!(-slope / 2.0f > TOLERANCE * cost))
-                return count + 1;
+                break;
         }
-        return iterations;
+        return count;
     }
 };
 
@@ -202,11 +222,11 @@ Memory s;
 const int dof = SIX * blocks, from = scene * dof;
 const Newton newton { { s, mass.data + scene * blocks * SQUARE, force.data + from, free.data + from, lane, blocks, dof,
                         rows, equalities } };
-for (int i = lane; i < DOF; i += LANES) {
+SHARE(i, 0, DOF) {
     s.at[i] = 0.0f;
     s.step[i] = i < dof ? velocity.data[from + i] : 0.0f;
 }
-for (int i = lane; i < rows; i += LANES) {
+SHARE(i, 0, rows) {
     for (int q = 0; q < SIX; ++q)
         s.row[i][q] = row.data[(scene * rows + i) * SIX + q];
     s.row_goal[i] = row_goal.data[scene * rows + i];
@@ -219,7 +239,7 @@ if (lane == 0) {
             s.chosen[s.count++] = scene * contacts + c;
 }
 newton.sync();
-for (int c = lane; c < s.count; c += LANES) {
+SHARE(c, 0, s.count) {
     const int at = s.chosen[c];
     // each side is 8 * block + a bit for each of the last three columns that move the body; -1: the table
     const int first = side.data[2 * at], second = side.data[2 * at + 1], swap = first > second;
@@ -252,17 +272,9 @@ for (int c = lane; c < s.count; c += LANES) {
 }
 newton.sync();
 newton.fill();
-// begin where it costs less: at the acceleration without constraints, or at that of the last time step
-for (int i = lane; i < dof; i += LANES)
-    s.at[i] = free.data[from + i];
-const float cost = newton.evaluate();
-for (int i = lane; i < dof; i += LANES)
-    s.at[i] = start.data[from + i];
-if (!(newton.evaluate() < cost))
-    for (int i = lane; i < dof; i += LANES)
-        s.at[i] = free.data[from + i];
-const int count = newton.minimize(iterations, limit);
-for (int i = lane; i < dof; i += LANES)
+const int count = newton.minimize(start.data + from, iterations, limit);
+SHARE(i, 0, dof)
     acceleration.data[from + i] = s.at[i];
 if (lane == 0)
     steps.data[scene] = count;
+#undef SHARE
