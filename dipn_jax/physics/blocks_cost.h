@@ -149,7 +149,6 @@ struct Terms {
                         if (has(i, k))
                             s.filled[i] |= 1 << j;
         }
-        sync();
     }
 
     // Compute at `s.at` what every contact and row pays, and its derivatives; return the cost.
@@ -179,7 +178,7 @@ struct Terms {
             }
         }
         cost = sum(cost) / 2.0f;
-        sync();
+        sync();  // a shuffle does not wait for shared memory
         return cost;
     }
 

@@ -12,10 +12,12 @@ import pytest
 import scipy.optimize
 from mujoco.mjx._src import forward
 
+from dipn_jax import physics
 from dipn_jax.errors import UserError
-from dipn_jax.physics import blocks, cone, mjx, patches
+from dipn_jax.physics import blocks, cone, mjx, native, patches
 from dipn_jax.physics.mjx_program import Program
-from dipn_jax.structs import Scene
+from dipn_jax.structs import Fault, Push, Scene
+from dipn_jax.world import clutter, primitives, scenes
 
 BLOCKS = 4
 CONTACTS = 9
@@ -197,6 +199,20 @@ def test_on_a_gpu_nothing_is_spilled_and_its_shared_memory_is_static(
     assert used.stack == 0, "registers or arrays are in local memory"
     assert used.registers <= MOST_REGISTERS
     assert 0 < used.shared <= STATIC_SHARED_MEMORY
+
+
+def test_pushes_end_where_mujoco_c_puts_them() -> None:
+    ours = physics.make_engine("mjx_warp")
+    reference = native.NativeEngine(ours.config)
+    items = clutter.settled_scenes(jax.random.key(1), reference, scenes.fixed_count(2), 4)
+    behind = items.poses[:, 0, :2] - np.array([0.05, 0.0], np.float32)
+    push = Push(behind, np.zeros(4, np.float32), np.full(4, 0.1, np.float32))
+    found, wanted = (primitives.push(engine, items.scene, items.poses, push) for engine in (ours, reference))
+    moved = np.linalg.norm(wanted.poses[:, 5, :, :3] - items.poses[..., :3], axis=-1)
+    assert (moved.max(-1) > 0.01).all()
+    apart = np.linalg.norm(found.poses[:, 5, :, :3] - wanted.poses[:, 5, :, :3], axis=-1)
+    assert np.median(apart[moved > 0.001]) < 0.001 and apart.max() < 0.003
+    np.testing.assert_array_equal(found.fault & ~Fault.UNSETTLED, wanted.fault & ~Fault.UNSETTLED)
 
 
 def test_without_warp_it_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
