@@ -10,6 +10,8 @@ It is an option of the engine `mjx` (`PhysicsConfig.solver`). On a CPU the same 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -110,20 +112,30 @@ def minimize(p: Problem, start: Float[Array, " V"], iterations: int, line: int) 
       iterations: most of Newton's steps.
       line: most tries of a line search.
     """
+    call = _call(len(p.mass), len(p.position), len(p.row), p.equalities, iterations, line)
+    acceleration, steps = call(*(jnp.asarray(getattr(p, name)).reshape(-1) for name in ARGUMENTS), start)
+    return acceleration, steps
+
+
+@functools.cache
+def _call(blocks: int, contacts: int, rows: int, equalities: int, iterations: int, line: int) -> Callable[..., Any]:
+    """Return the kernel as a traced function of flat arrays, for those numbers of each and those limits."""
     from warp import jax_kernel
 
     native = load()
-    blocks, contacts, rows = len(p.mass), len(p.position), len(p.row)
+    kernel = native.kernel(*capacity(blocks - 1, contacts))
+    numbers = blocks, contacts, rows, equalities, iterations, line
+    # the name of the call in a program is made of this, and its number is 0 where it is traced once: the same in every
+    # process, so that XLA finds what it compiled in another
+    kernel.func.__qualname__ = "blocks_" + "_".join(map(str, numbers))
     call = jax_kernel(
-        native.kernel(*capacity(blocks - 1, contacts)),
+        kernel,
         num_outputs=2,
         launch_dims=(1, native.LANES),
         output_dims={"acceleration": SIZE * blocks, "steps": 1},
         block_dim=native.LANES,
     )
-    flat = [jnp.asarray(getattr(p, name)).reshape(-1) for name in ARGUMENTS]
-    acceleration, steps = call(*flat, start, blocks, contacts, rows, p.equalities, iterations, line)
-    return acceleration, steps
+    return jax.jit(lambda *leaves: call(*leaves, *numbers))
 
 
 def _sides(m: Any) -> np.ndarray:

@@ -36,7 +36,6 @@ def _source(blocks: int, contacts: int) -> str:
 
 
 @functools.cache
-@typing.no_type_check
 def kernel(blocks: int, contacts: int) -> Any:
     """Return the kernel with room for that many blocks of six degrees of freedom and contacts of a scene.
 
@@ -50,9 +49,12 @@ def kernel(blocks: int, contacts: int) -> Any:
     - `start [blocks, 6]`: an acceleration to begin from, where it costs less than `free`;
     - out: `acceleration [blocks, 6]`, `steps` (of Newton's).
     """
+    floats: Any
+    integers: Any
     floats, integers = wp.array(dtype=wp.float32), wp.array(dtype=wp.int32)
 
     @wp.func_native(_source(blocks, contacts))
+    @typing.no_type_check
     def solve_scene(
         mass: floats, force: floats, free: floats, velocity: floats, center: floats, axes: floats, row: floats,
         row_goal: floats, row_weight: floats, position: floats, frame: floats, side: integers, scale: floats,
@@ -61,6 +63,7 @@ def kernel(blocks: int, contacts: int) -> Any:
     ): ...  # fmt: skip
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    @typing.no_type_check
     def solve(
         mass: floats, force: floats, free: floats, velocity: floats, center: floats, axes: floats, row: floats,
         row_goal: floats, row_weight: floats, position: floats, frame: floats, side: integers, scale: floats,
