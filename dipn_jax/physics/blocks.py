@@ -30,6 +30,8 @@ SIZE = 6
 """Degrees of freedom of a block."""
 CAPACITIES = ((8, 80), (15, 112))
 """Blocks and contacts of a scene that there are kernels for: 7 objects, and the most whose shared memory is static."""
+PLATFORMS = ("cpu", "gpu")
+"""Kinds of devices of JAX that Warp has kernels for."""
 ARGUMENTS = (
     *("mass", "force", "free", "velocity", "center", "axes", "row", "row_goal", "row_weight"),
     *("position", "frame", "side", "scale", "stiffness", "damping", "bias"),
@@ -81,6 +83,17 @@ def capacity(slots: int, contacts: int) -> tuple[int, int]:
         f"solver warp: {slots} object slots and {contacts} contacts a scene; "
         f"want at most {blocks - 1} and {most} (solver xla has no limit)"
     )
+
+
+def check(platform: str) -> None:
+    """Check that the kernel can run on a device of JAX of this kind.
+
+    Raises:
+      UserError: Warp has no such devices, or it is not installed.
+    """
+    if platform not in PLATFORMS:
+        raise UserError(f"solver warp: JAX computes on {platform}; want {' or '.join(PLATFORMS)}, or solver xla")
+    load()
 
 
 def load() -> Any:

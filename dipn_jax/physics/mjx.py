@@ -61,11 +61,11 @@ class MjxEngine:
             solver is asked for and cannot be used here.
         """
         self.substeps = physics.substeps(config)
+        local = list(devices or jax.local_devices())
         if config.solver == "warp":
-            blocks.load()
+            blocks.check(local[0].platform)
         patches.register()
         self.config = config
-        local = list(devices or jax.local_devices())
         self.devices = local[: 1 << (len(local).bit_length() - 1)]
         if chunk and chunk & (chunk - 1):
             raise UserError(f"mjx: chunk {chunk}; want a power of two")
@@ -110,6 +110,8 @@ class MjxEngine:
         """Return the compiled function for `size` scenes of `slots` objects; each device runs its share by itself."""
         key = size, slots, len(arguments[4]), arguments[2].time.shape[1]
         if key not in self.programs:
+            if self.config.solver == "warp":
+                blocks.capacity(slots, self.config.caps(slots)[1])
             made = Program(self.config, slots, self.substeps)
             alone = len(self.devices) == 1 and self.devices[0].platform == jax.default_backend()
             kept_on_disk = alone and self.config.solver == "xla"  # a call of Warp is of this process

@@ -204,7 +204,9 @@ def test_on_a_gpu_nothing_is_spilled_and_its_shared_memory_is_static(
     assert 0 < used.shared <= STATIC_SHARED_MEMORY
 
 
-def test_pushes_end_where_mujoco_c_puts_them() -> None:
+def test_pushes_end_where_mujoco_c_puts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved, own = [], blocks.solve
+    monkeypatch.setattr(blocks, "solve", lambda m, d: solved.append(m.nv) or own(m, d))
     ours = physics.make_engine("mjx_warp")
     reference = native.NativeEngine(ours.config)
     items = clutter.settled_scenes(jax.random.key(1), reference, scenes.fixed_count(2), 4)
@@ -215,6 +217,7 @@ def test_pushes_end_where_mujoco_c_puts_them() -> None:
     moved = np.linalg.norm(wanted.poses[:, -1, :, :3] - items.poses[..., :3], axis=-1)
     assert (moved.max(-1) > 0.01).all()
     apart = np.linalg.norm(found.poses[:, -1, :, :3] - wanted.poses[:, -1, :, :3], axis=-1)[moved > 0.001]
+    assert set(solved) == {18}, "two objects and the hand, by the kernel"
     assert np.median(apart) < 0.001 and apart.max() < 0.003
     np.testing.assert_array_equal(found.fault, wanted.fault)
 
@@ -222,7 +225,7 @@ def test_pushes_end_where_mujoco_c_puts_them() -> None:
 def test_without_warp_it_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "warp", None)
     with pytest.raises(UserError, match=r"solver warp: .*dipn-jax\[warp\].* or solver xla$") as error:
-        mjx.MjxEngine(mjx.DEFAULTS.__class__(solver="warp"))
+        physics.make_engine("mjx_warp")
     assert "\n" not in str(error.value)
 
 
@@ -231,3 +234,13 @@ def test_more_objects_or_contacts_than_there_is_room_for_are_refused() -> None:
     for size in ((15, 112), (7, 113), (7, -1)):
         with pytest.raises(UserError, match=r"object slots and .* contacts a scene; want at most 14 and 112"):
             blocks.capacity(*size)
+    size, full = np.full((1, 15, 3), 0.05, np.float32), np.full((1, 15), 0.35, np.float32)
+    crowd = Scene(np.zeros((1, 15), np.int32), size, size, full, full)
+    with pytest.raises(UserError, match="15 object slots"):
+        primitives.settle(physics.make_engine("mjx_warp"), crowd, np.zeros((1, 15, 7), np.float32), duration=0.01)
+
+
+def test_it_is_an_option_and_runs_where_warp_does() -> None:
+    assert physics.make_engine("mjx").config == mjx.DEFAULTS and mjx.DEFAULTS.solver == "xla"
+    with pytest.raises(UserError, match="solver warp: JAX computes on tpu; want cpu or gpu, or solver xla"):
+        blocks.check("tpu")
