@@ -102,6 +102,20 @@ def test_the_least_cost_is_found_in_float32(sticking: bool) -> None:
         assert 1 < steps < 30
 
 
+def test_a_step_is_that_of_dense_rows_and_ends_where_the_slope_is_small() -> None:
+    problems = [_problem(np.random.default_rng(seed), sticking=False) for seed in range(20)]
+    moved, _ = _launched(problems, 1, iterations=1)
+    newton = jax.jit(cone._newton)
+    for p, a in zip(problems, moved, strict=True):
+        dense = _dense(p)
+        step = np.asarray(newton(dense, p.free)[2], float)
+        multiple = (a - p.free) @ step / (step @ step)
+        np.testing.assert_allclose(a - p.free, multiple * step, atol=1e-3 * np.abs(multiple * step).max())
+        exact, h = cone_cost.exact(dense), 1e-4
+        at = [cone_cost.cost(exact, p.free + t * step) for t in (-h, h, multiple - h, multiple + h)]
+        assert abs(at[3] - at[2]) < 1.1 * cone.FLAT_SLOPE * abs(at[1] - at[0])
+
+
 def _state(m: Any, data: Any, qpos: jax.Array, qvel: jax.Array) -> Any:
     """Return the data of a state as the solver is given it."""
     d = data.replace(qpos=qpos, qvel=qvel)
@@ -157,16 +171,16 @@ def test_a_state_of_mjx_gets_the_acceleration_that_dense_rows_give(
     np.testing.assert_allclose(found, wanted, atol=1e-3 * np.abs(wanted).max())
 
 
-def _launched(problems: list[blocks.Problem], lanes: int) -> tuple[np.ndarray, np.ndarray]:
+def _launched(problems: list[blocks.Problem], lanes: int, iterations: int = 50) -> tuple[np.ndarray, np.ndarray]:
     """Return accelerations `[B, V]` and steps `[B]` of the kernel launched with that many lanes on the CPU."""
     import warp
 
     names = list(blocks.ARGUMENTS)
     leaves = [np.stack([getattr(p, name) for p in problems]) for name in names]
     arrays = [warp.array(leaf.ravel(), dtype=warp.int32 if leaf.dtype.kind == "i" else float) for leaf in leaves]
-    start = warp.zeros(problems[0].free.size * len(problems), dtype=float)
+    start = warp.full(problems[0].free.size * len(problems), float("nan"), dtype=float)  # so it begins at `free`
     out, steps = warp.zeros_like(start), warp.zeros(len(problems), dtype=warp.int32)
-    numbers = [BLOCKS, CONTACTS, ROWS, 1, 50, 50]
+    numbers = [BLOCKS, CONTACTS, ROWS, 1, iterations, 50]
     native = blocks.load()
     kernel = native.kernel(*blocks.CAPACITIES[0])
     inputs = [*arrays, start, *numbers, out, steps]
