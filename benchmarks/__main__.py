@@ -34,6 +34,11 @@ BENCHMARKS = {
     "datagen_mjx.batch_scaling": Benchmark(
         "cost of a scene's step at batch 128 over that at batch 16", "<= 1.0", "datagen_mjx:batch_scaling"
     ),
+    "datagen_mjx.kernel": Benchmark(
+        "seconds of the MJX engine over those with its solver as a Warp kernel, and of a scene's step",
+        "none",
+        "datagen_mjx:kernel",
+    ),
     "datagen_mjx.settings": Benchmark(
         "other settings of MJX: time over that of its own, millimetres from MuJoCo C after 5 cm, faults",
         "none",

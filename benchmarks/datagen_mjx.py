@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib.util
 from collections.abc import Callable, Iterator
 from typing import Any
 from xml.etree import ElementTree
@@ -14,9 +15,10 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from benchmarks.harness import Setting, alternate
+from benchmarks.harness import Setting, Skipped, alternate
 from dipn_jax import geometry, structs
 from dipn_jax.engine import PhysicsConfig
+from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine, substeps
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.structs import Scene
@@ -30,9 +32,9 @@ FALL_SECONDS = 0.5
 
 
 @functools.cache
-def engine() -> MjxEngine:
+def engine(name: EngineName = "mjx") -> MjxEngine:
     """Return one engine for all benchmarks: it keeps its compiled programs."""
-    made = make_engine("mjx")
+    made = make_engine(name)
     assert isinstance(made, MjxEngine)
     return made
 
@@ -96,10 +98,10 @@ class Naive:
         return self.last
 
 
-def ours(scene: Scene, poses: np.ndarray, duration: float) -> Callable[[], Any]:
+def ours(scene: Scene, poses: np.ndarray, duration: float, name: EngineName = "mjx") -> Callable[[], Any]:
     """Return work for the clock: the engine's own program for `duration` seconds."""
     still, end = primitives.parked_trajectory(len(poses), duration), np.array([duration])
-    return lambda: engine().simulate(scene, poses, still, end)
+    return lambda: engine(name).simulate(scene, poses, still, end)
 
 
 def vs_naive(setting: Setting) -> Iterator[tuple[str, float]]:
@@ -126,3 +128,18 @@ def batch_scaling(setting: Setting) -> Iterator[tuple[str, float]]:
     few(), many()  # compile
     small, large = alternate(few, many, repeats=setting.pick(3, 7))
     yield "datagen_mjx.batch_scaling", (large / 128) / (small / 16)
+
+
+def kernel(setting: Setting) -> Iterator[tuple[str, float]]:
+    """Measure seconds of the engine over those with its solver as a Warp kernel, and milliseconds of a scene's step."""
+    if importlib.util.find_spec("warp") is None:
+        raise Skipped("datagen_mjx.kernel: warp is not installed; want pip install '.[warp]'")
+    duration, batch = setting.pick(10, 30) / 100, 32 if jax.default_backend() == "cpu" else 1024
+    steps = batch * round(duration / 0.01) * substeps(engine().config)
+    scene, poses = heaps(setting.seed, batch)
+    plain, blocks = ours(scene, poses, duration), ours(scene, poses, duration, "mjx_warp")
+    plain(), blocks()  # compile
+    theirs, mine = alternate(plain, blocks, repeats=setting.pick(5, 7))
+    yield f"datagen_mjx.kernel/{batch}", theirs / mine
+    yield "datagen_mjx.kernel/milliseconds", 1000 * mine / steps
+    yield "datagen_mjx.kernel/milliseconds_without", 1000 * theirs / steps

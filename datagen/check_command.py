@@ -24,7 +24,8 @@ def check_world(
 
     Args:
       out: folder for metrics.json and world.md; the same command continues where it stopped.
-      engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx and warp are held against native.
+      engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx, mjx_warp and warp are held against
+        native.
       scenes_: scenes with a push and a grasp each.
       few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
       tries: grasps of every catalogue item.

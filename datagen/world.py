@@ -49,6 +49,7 @@ ENGINES = {
     "native_3.3ms": Variant("native", timestep=0.01 / 3),
     "native_5ms": Variant("native", timestep=0.005),
     "mjx": Variant("mjx"),
+    "mjx_warp": Variant("mjx_warp"),
     "warp": Variant("warp"),
 }
 """Engines that can be compared with `native` as it is (2 ms, resting objects asleep)."""

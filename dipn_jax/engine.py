@@ -6,7 +6,7 @@ The engines themselves are in `dipn_jax.physics`; a function that simulates take
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Literal, Protocol
 
 from jaxtyping import Float
 
@@ -28,6 +28,7 @@ class PhysicsConfig:
     sleep: float = 0.0  # m/s below which resting objects are left out of steps until they are touched (0: never)
     geom_pairs: tuple[int, int] | None = None  # MJX: pairs kept by the broad phase: at least, and per object
     contact_points: tuple[int, int] | None = None  # MJX: contacts kept: at least, and per object (None: all)
+    solver: Literal["xla", "warp"] = "xla"  # MJX: of contacts; `warp` is one kernel, by NVIDIA Warp (an extra)
 
     def caps(self, slots: int) -> tuple[int, int]:
         """Return how many geom pairs and contacts MJX keeps with `slots` objects; -1 means all."""

@@ -42,7 +42,7 @@ def code_digest(*folders: pathlib.Path) -> str:
     """Return the SHA-256, in hex, of the packages' versions, the library's sources and those in other `folders`."""
     digest = hashlib.sha256(str(package_versions()).encode())
     for folder in (pathlib.Path(__file__).parent, *folders):
-        for path in sorted(folder.rglob("*.py")):
+        for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.h")]):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -1,5 +1,7 @@
 """One interface, three engines: `native` (MuJoCo C on CPU threads), `mjx` (XLA: GPU, TPU, CPU) and `warp` (NVIDIA).
 
+`mjx_warp` is `mjx` with the solver of `blocks`.
+
 All read the same MJCF (`dipn_jax.world.model`), take the same arguments and return the same result, so which
 one runs is a configuration value.
 """
@@ -72,7 +74,7 @@ def resolve(name: EngineName) -> EngineName:
     """Return the name of an engine: `auto` is `native`, or `mjx` on an accelerator whose host has few cores.
 
     Few are less than ENOUGH_CORES. It is never `warp`, though that is faster on a GPU: it is an extra, and its scenes
-    share their room for contacts.
+    share their room for contacts. `mjx_warp` needs the same extra and has not been measured on a GPU.
     """
     if name == "auto":
         return "native" if jax.default_backend() == "cpu" or cores() >= ENOUGH_CORES else "mjx"
@@ -88,8 +90,8 @@ def make_engine(
       engine = dipn_jax.make_engine("native")
       tables = dipn_jax.settled_scenes(jax.random.key(0), engine, dipn_jax.SceneConfig(), 2)
 
-    Making `mjx` patches MuJoCo MJX in the whole process (`physics.patches`); models of other code that uses MJX in the
-    process are passed on to MJX's own functions. `native` and `warp` patch nothing.
+    Making `mjx` or `mjx_warp` patches MuJoCo MJX in the whole process (`physics.patches`); models of other code that
+    uses MJX in the process are passed on to MJX's own functions. `native` and `warp` patch nothing.
 
     Args:
       name: engine, or `auto`.
@@ -112,11 +114,15 @@ def make_engine(
         from dipn_jax.physics import mjx
 
         return mjx.MjxEngine(_configured(mjx.DEFAULTS, timestep, sleep))
+    if name == "mjx_warp":
+        from dipn_jax.physics import mjx
+
+        return mjx.MjxEngine(_configured(dataclasses.replace(mjx.DEFAULTS, solver="warp"), timestep, sleep))
     if name == "warp":
         from dipn_jax.physics import warp
 
         return warp.WarpEngine(_configured(warp.DEFAULTS, timestep, sleep))
-    raise UserError(f"engine {name!r}: want auto, native, mjx or warp")
+    raise UserError(f"engine {name!r}: want auto, native, mjx, mjx_warp or warp")
 
 
 def _configured(config: PhysicsConfig, timestep: float | None, sleep: float | None) -> PhysicsConfig:

@@ -37,7 +37,7 @@ FIRST_STEPS = np.float32(4.0) ** np.arange(-6, 2, dtype=np.float32)
 """Multiples of a Newton step that are tried first, all at once: many cost an accelerator no more than one."""
 STRETCH_LIMIT = 4.0 ** len(FIRST_STEPS)
 """Factor by which a step grows at most from one round of tries to the next while the minimum is further on."""
-_TINY = 1e-12
+TINY = 1e-12
 """Least divisor: lengths and squares are raised to it before something is divided by them."""
 
 
@@ -74,13 +74,13 @@ def _reach(u: jax.Array, mu: jax.Array) -> _Reach:
     """Project `u [C, K]` on the cones `u_0 >= mu |u_t|`."""
     slide = u.at[:, 0].set(0.0)
     length = jnp.linalg.norm(slide, axis=-1)
-    tangent = slide / jnp.maximum(length, _TINY)[:, None]
+    tangent = slide / jnp.maximum(length, TINY)[:, None]
     below = (mu * u[:, 0] + length <= 0) & (u[:, 0] < 0)
     short = jnp.minimum(u[:, 0] - mu * length, 0.0)  # of the side
     beside = jnp.where(below | (short >= 0), 0.0, 1 / (1 + mu**2))
     inward = (-mu[:, None] * tangent).at[:, 0].set(1.0)
     away = jnp.where(below[:, None], u, (beside * short)[:, None] * inward)
-    return _Reach(away, below, beside, inward, tangent, -short * mu / jnp.maximum(length, _TINY))
+    return _Reach(away, below, beside, inward, tangent, -short * mu / jnp.maximum(length, TINY))
 
 
 def _curvature(reach: _Reach, w: jax.Array) -> jax.Array:
@@ -228,7 +228,7 @@ def _problem(m: Any, d: Any) -> tuple[_Problem, np.ndarray, jax.Array]:
         always=jnp.asarray(others < impl.ne),
         cones=scale[:, :, None] * impl.efc_J[index],
         cone_goal=scale * impl.efc_aref[index],
-        stiffness=impl.efc_D[first] / jnp.maximum(mu**2, _TINY),
+        stiffness=impl.efc_D[first] / jnp.maximum(mu**2, TINY),
         mu=mu,
     )
     return problem, index, scale

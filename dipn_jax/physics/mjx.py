@@ -20,7 +20,7 @@ from jaxtyping import Float
 from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.errors import UserError
-from dipn_jax.physics import kept, patches
+from dipn_jax.physics import blocks, kept, patches
 from dipn_jax.physics.mjx_program import Program
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
@@ -57,12 +57,15 @@ class MjxEngine:
           devices: devices that share every chunk; all local ones if not given. A power of two of them are used.
 
         Raises:
-          UserError: the control period is not a whole number of time steps, or `chunk` is no power of two.
+          UserError: the control period is not a whole number of time steps, `chunk` is no power of two, or the Warp
+            solver is asked for and cannot be used here.
         """
         self.substeps = physics.substeps(config)
+        local = list(devices or jax.local_devices())
+        if config.solver == "warp":
+            blocks.check(local[0].platform)
         patches.register()
         self.config = config
-        local = list(devices or jax.local_devices())
         self.devices = local[: 1 << (len(local).bit_length() - 1)]
         if chunk and chunk & (chunk - 1):
             raise UserError(f"mjx: chunk {chunk}; want a power of two")
@@ -107,9 +110,12 @@ class MjxEngine:
         """Return the compiled function for `size` scenes of `slots` objects; each device runs its share by itself."""
         key = size, slots, len(arguments[4]), arguments[2].time.shape[1]
         if key not in self.programs:
+            if self.config.solver == "warp":
+                blocks.capacity(slots, self.config.caps(slots)[1])
             made = Program(self.config, slots, self.substeps)
             alone = len(self.devices) == 1 and self.devices[0].platform == jax.default_backend()
-            self.programs[key] = self._kept(made, arguments) if alone else self._shared(made)
+            kept_on_disk = alone and self.config.solver == "xla"  # a call of Warp is of this process
+            self.programs[key] = self._kept(made, arguments) if kept_on_disk else self._shared(made)
         return self.programs[key]
 
     def _shared(self, made: Program) -> Callable[..., Rollout]:

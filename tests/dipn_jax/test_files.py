@@ -150,3 +150,12 @@ def test_a_file_system_that_syncs_no_folders_is_put_up_with(
     with pytest.raises(OSError, match=r"b\.txt"):
         files.write_text(tmp_path / "b.txt", "b")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_the_digest_of_the_code_covers_its_kernels(tmp_path: pathlib.Path) -> None:
+    found = {files.code_digest(tmp_path)}
+    for name in ("a.py", "a.h"):
+        (tmp_path / name).write_text("1")
+        found.add(files.code_digest(tmp_path))
+    (tmp_path / "notes.txt").write_text("1")
+    assert len(found) == 3 and files.code_digest(tmp_path) in found
