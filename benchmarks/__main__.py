@@ -79,6 +79,9 @@ BENCHMARKS = {
     "engines.scene_seconds": Benchmark(
         "seconds of heaps of seven objects simulated a second, by each engine", "none", "rates:scene_seconds"
     ),
+    "engines.warp_room": Benchmark(
+        "contacts, touching pairs and rows of MuJoCo Warp: the most of a scene, an object", "none", "warp_room:seen"
+    ),
     "rates.native": Benchmark("episodes a second of MuJoCo C, 1 to 30 objects", "none", "rates:native"),
     "rates.mjx": Benchmark("episodes a second of MJX, 1 to 30 objects", "none", "rates:mjx"),
     "rates.warp": Benchmark("episodes a second of MuJoCo Warp, 1 to 30 objects", "none", "rates:warp"),

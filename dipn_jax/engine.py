@@ -20,6 +20,7 @@ class PhysicsConfig:
     timestep: float = 0.002  # seconds
     iterations: int = 50
     ls_iterations: int = 50
+    tolerance: float = 1e-8  # MuJoCo Warp, in float32, takes 1e-6 instead of anything smaller
     impratio: float = 10.0  # halves the slip of a lifted object
     cone: str = "elliptic"  # or pyramidal
     solref: str = "0.01 1"  # softer makes grasps wrong

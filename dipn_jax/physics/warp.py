@@ -11,7 +11,7 @@ cuboids are meshes of eight corners. Agreement with the native engine: docs/worl
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -28,14 +28,29 @@ from dipn_jax.world.model import GRIPPER_DOF
 from dipn_jax.world.scenes import parked
 
 DEFAULTS = PhysicsConfig()
-CONTACTS_PER_OBJECT = 24
-"""Contacts that there is room for, for every object and the gripper; measured: at most 59 a scene of 7 objects."""
-PAIRS_PER_OBJECT = 12
-"""Pairs of convex geoms that there is room for, likewise."""
-ROWS_PER_OBJECT = 72
-"""Rows of constraints that there is room for, likewise; measured: at most 186 a scene of 7 objects."""
-MOST_DENSE_DOF = 60
-"""Degrees of freedom up to which MuJoCo Warp takes a dense Jacobian."""
+CHUNK, CHUNK_ON_GPU = 512, 2048
+"""Most scenes simulated at once, on a CPU and on a GPU. An H200 made 209 scene seconds a second of 512 and 353 of 2,048
+(docs/benchmarks.md); more were not tried there."""
+MOST_DENSE_DOF = 32
+"""Degrees of freedom up to which a dense Jacobian is the default, as in MuJoCo Warp itself."""
+JACOBIANS = {
+    "dense": mujoco.mjtJacobian.mjJAC_DENSE,
+    "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
+}
+"""Forms of the constraints' Jacobian, by name."""
+
+
+class Room(NamedTuple):
+    """How much there is room for, times the objects of the fullest scene and the gripper.
+
+    All scenes of a batch share their contacts and pairs; each has its own rows. Seen (`python -m benchmarks
+    engines.warp_room`): at most 13 contacts, 2.5 pairs and 44 rows with one object, which a grasp presses on the
+    table, and 8.8, 1.3 and 30 with three and more.
+    """
+
+    contacts: int = 16
+    pairs: int = 4  # of convex parts that touch, the table not counted
+    rows: int = 64  # of constraints: three a contact
 
 
 def _load() -> tuple[Any, Any]:
@@ -62,21 +77,36 @@ class WarpEngine:
 
     name = "warp"
 
-    def __init__(self, config: PhysicsConfig = DEFAULTS, *, chunk: int = 512) -> None:
+    def __init__(
+        self,
+        config: PhysicsConfig = DEFAULTS,
+        *,
+        chunk: int | None = None,
+        jacobian: str = "auto",
+        room: tuple[int, int, int] = Room(),
+    ) -> None:
         """Make an engine; kernels are compiled when it is first used, and Warp caches them on disk.
 
         Args:
           config: solver settings; the control period must be a whole number of time steps.
-          chunk: most scenes simulated at once.
+          chunk: most scenes simulated at once; if not given, CHUNK or CHUNK_ON_GPU.
+          jacobian: `dense`, `sparse`, or `auto`: sparse above MOST_DENSE_DOF degrees of freedom, as of five objects.
+          room: see `Room`; what does not fit is left out, and a fault.
 
         Raises:
-          UserError: Warp cannot be used, or the time step does not divide the control period.
+          UserError: Warp cannot be used, the time step does not divide the control period, or no such Jacobian, chunk
+            or room.
         """
         self.substeps = physics.substeps(config)
-        self.config, self.chunk, self.batch = config, chunk, chunk
+        if jacobian not in ("auto", *JACOBIANS):
+            raise UserError(f"engine warp: jacobian {jacobian!r}: want auto, dense or sparse")
+        if min(*room, 1 if chunk is None else chunk) < 1:
+            raise UserError(f"engine warp: chunk {chunk}, room {tuple(room)}: want whole numbers from 1 on")
+        self.config, self.jacobian, self.room = config, jacobian, Room(*room)
         self.stopped, self._running = threading.Event(), threading.Lock()
         self.warp, self.mujoco_warp = _load()
         self.device = self.warp.get_preferred_device()  # the first GPU, or else the CPU
+        self.chunk = self.batch = chunk or (CHUNK_ON_GPU if self.device.is_cuda else CHUNK)
 
     def simulate(
         self,
@@ -108,11 +138,11 @@ class WarpEngine:
         present = packed.shape >= 0
         start = np.where(present[..., None], np.take_along_axis(poses, slots[..., None], 1), parked(present.shape[1]))
         qpos = np.concatenate([hosted.controls(paths, np.zeros(1))[0], start.reshape(len(start), -1)], -1)
-        sims = _Worlds(packed, qpos, self)
+        sims = Worlds(packed, qpos, self)
         return hosted.follow(sims, packed, slots, poses, paths, instants, settle=settle, fence=fence)
 
 
-class _Worlds:
+class Worlds:
     """See `hosted.Worlds`: a batch on a device, with copies of its state on the host in between.
 
     The steps of a control period are recorded once, as a graph; on a GPU that is a CUDA graph.
@@ -127,7 +157,7 @@ class _Worlds:
         self.warp, self.mjw = engine.warp, engine.mujoco_warp
         self.engine = engine
         batch, slots = scenes.shape.shape
-        spec, mesh = _compile(scenes, engine.config)
+        spec, mesh = _compile(scenes, engine)
         fields = _fields(spec, scenes, mesh)
         try:
             self.model = self.mjw.put_model(spec, batch_sizes={name: len(rows) for name, rows in fields.items()})
@@ -137,8 +167,8 @@ class _Worlds:
             here = getattr(self.model, name)
             here.assign(rows.reshape(here.numpy().shape))
         self.model.opt.warn_overflow = 0  # kept in `data.overflow` all the same
-        room = [per_object * (slots + 1) for per_object in (CONTACTS_PER_OBJECT, PAIRS_PER_OBJECT, ROWS_PER_OBJECT)]
-        self.data = self.mjw.make_data(spec, batch, nconmax=room[0], nccdmax=room[1], njmax=room[2])
+        contacts, pairs, most = (each * (slots + 1) for each in engine.room)
+        self.data = self.mjw.make_data(spec, batch, nconmax=max(contacts, pairs), nccdmax=pairs, njmax=most)
         self.qpos, self.qvel = qpos, np.zeros((batch, spec.nv))
         self.ctrl, self.qfrc_applied = np.zeros((batch, spec.nu)), np.zeros((batch, spec.nv))
         self.graph = self._capture(engine.substeps)
@@ -196,13 +226,14 @@ class _Worlds:
         return out
 
 
-def _compile(scenes: Scene, config: PhysicsConfig) -> tuple[mujoco.MjModel, np.ndarray]:
+def _compile(scenes: Scene, engine: WarpEngine) -> tuple[mujoco.MjModel, np.ndarray]:
     """Return the model of all `scenes [B, N]`, and the mesh of each part `[B, N, P]`; -1 where there is none."""
-    text = model.mjcf(jax.tree.map(lambda leaf: leaf[0], scenes), config=config, generic=True)
+    text = model.mjcf(jax.tree.map(lambda leaf: leaf[0], scenes), config=engine.config, generic=True)
     spec = mujoco.MjSpec.from_string(text)
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp has no reset to disable
-    if GRIPPER_DOF + 6 * scenes.shape.shape[1] > MOST_DENSE_DOF:
-        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    dense = GRIPPER_DOF + 6 * scenes.shape.shape[1] <= MOST_DENSE_DOF
+    jacobian = engine.jacobian if engine.jacobian != "auto" else "dense" if dense else "sparse"
+    spec.option.jacobian = JACOBIANS[jacobian]
     names, made = np.full((*scenes.shape.shape, shapes.PARTS), "", object), set()
     for b, slot in np.argwhere(scenes.shape >= 0):
         shape, size = int(scenes.shape[b, slot]), scenes.size[b, slot].astype(float)

@@ -3,6 +3,7 @@
 import sys
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -26,8 +27,10 @@ def warp_engine() -> Any:
     return physics.make_engine("warp")
 
 
-def test_it_follows_the_native_engine(warp_engine: Any, engine: Any, settled: Any) -> None:
-    scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2].copy()
+@pytest.mark.parametrize("objects", [5, 2], ids=["sparse", "dense"])
+def test_it_follows_the_native_engine(warp_engine: Any, engine: Any, settled: Any, objects: int) -> None:
+    scene = jax.tree.map(lambda leaf: leaf[:2, :objects], settled.scene)
+    poses = settled.poses[:2, :objects].copy()
     poses[:, :, 2] += 0.01
     found = primitives.settle(warp_engine, scene, poses, duration=0.06)
     wanted = primitives.settle(engine, scene, poses, duration=0.06)
@@ -45,14 +48,18 @@ def test_a_position_that_is_not_finite_or_outside_is_a_fault_of_its_own_episode(
     assert fault[2] & ~Fault.UNSETTLED == 0
 
 
-def test_lack_of_room_for_contacts_is_a_fault(warp_engine: Any, settled: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("room", [(1, 1, 64), (16, 4, 1)], ids=["contacts", "rows"])
+def test_lack_of_room_is_a_fault(settled: Any, room: tuple[int, int, int]) -> None:
     scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2]
-    for limits in (("CONTACTS_PER_OBJECT", "PAIRS_PER_OBJECT"), ("ROWS_PER_OBJECT",)):
-        with monkeypatch.context() as patch:
-            for limit in limits:
-                patch.setattr(warp, limit, 1)
-            fault = primitives.settle(warp_engine, scene, poses, duration=0.01).fault
-        assert (fault & Fault.CAPACITY).any()
+    fault = primitives.settle(warp.WarpEngine(room=room), scene, poses, duration=0.01).fault
+    assert (fault & Fault.CAPACITY).any()
+
+
+@pytest.mark.parametrize("options", [{"jacobian": "thin"}, {"chunk": 0}, {"room": (16, 0, 64)}])
+def test_settings_that_cannot_be_are_refused_in_one_line(options: dict[str, Any]) -> None:
+    with pytest.raises(UserError, match=r"engine warp: .*want") as error:
+        warp.WarpEngine(**options)
+    assert "\n" not in str(error.value)
 
 
 def test_an_object_inside_another_is_a_fault(warp_engine: Any, settled: Any) -> None:
