@@ -13,7 +13,8 @@ from benchmarks.harness import Setting, Skipped
 from dipn_jax import structs
 from dipn_jax.engine import Engine
 from dipn_jax.physics import hosted, make_engine
-from dipn_jax.physics.warp import WarpEngine, Worlds
+from dipn_jax.physics.warp import WarpEngine
+from dipn_jax.physics.warp_worlds import Worlds
 from dipn_jax.structs import Rollout, Scene, Trajectory
 from dipn_jax.world import clutter, primitives, scenes
 
@@ -70,7 +71,8 @@ def needs(engine: WarpEngine, scene: Scene, rollout: Rollout) -> np.ndarray:
     bodies = np.take_along_axis(poses, slots[..., None], 1).reshape(len(poses), -1)
     hand = np.concatenate([hand[:, :4], hand[:, 4:] / 2, hand[:, 4:] / 2], -1)
     with engine.warp.ScopedDevice(engine.device):
-        worlds = Worlds(packed, np.concatenate([hand, bodies], -1), engine)
+        worlds = Worlds(packed, 2, engine)
+        worlds.data.qpos.assign(np.concatenate([hand, bodies], -1).astype(np.float32))
         engine.mujoco_warp.fwd_position(worlds.model, worlds.data)
         return _count(engine, worlds, len(poses))
 
