@@ -77,6 +77,7 @@ class WarpEngine:
         chunk: int | None = None,
         jacobian: str = "auto",
         room: tuple[int, int, int] = Room(),
+        awake: int | None = None,
     ) -> None:
         """Make an engine; kernels are compiled when it is first used, and Warp caches them on disk.
 
@@ -85,17 +86,23 @@ class WarpEngine:
           chunk: most scenes simulated at once; if not given, CHUNK or CHUNK_ON_GPU.
           jacobian: `dense`, `sparse`, or `auto`: sparse above MOST_DENSE_DOF degrees of freedom, as of five objects.
           room: see `Room`; what does not fit is left out, and a fault.
+          awake: for tables at rest, not for drops: objects begin asleep, and there is room for so many of a scene that
+            are awake at once; more are a fault. If not given, all begin awake. Wants `config.sleep`.
 
         Raises:
-          UserError: Warp cannot be used, the time step does not divide the control period, or no such Jacobian, chunk
-            or room.
+          UserError: Warp cannot be used, the time step does not divide the control period, or no such Jacobian, chunk,
+            room or awake.
         """
         self.substeps = physics.substeps(config)
         if jacobian not in ("auto", *JACOBIANS):
             raise UserError(f"engine warp: jacobian {jacobian!r}: want auto, dense or sparse")
         if min(*room, 1 if chunk is None else chunk) < 1:
             raise UserError(f"engine warp: chunk {chunk}, room {tuple(room)}: want whole numbers from 1 on")
-        self.config, self.jacobian, self.room = config, jacobian, Room(*room)
+        if awake is not None and (awake < 1 or not config.sleep):
+            raise UserError(
+                f"engine warp: awake {awake}, sleep {config.sleep}: want objects from 1 on, and sleep above 0"
+            )
+        self.config, self.jacobian, self.room, self.awake = config, jacobian, Room(*room), awake
         self.stopped, self._running = threading.Event(), threading.Lock()
         self.warp, self.mujoco_warp = _load()
         self.device = self.warp.get_preferred_device()  # the first GPU, or else the CPU

@@ -47,9 +47,12 @@ class Worlds:
         self.spec = warp_model.compiled(slots, engine.config, JACOBIANS[jacobian])
         rows = dict.fromkeys(warp_model.SCENE_FIELDS, warp_model.row_count(batch))
         contacts, pairs, most = (each * (slots + 1) for each in engine.room)
+        awake = None if engine.awake is None else GRIPPER_DOF + 6 * min(engine.awake, slots)
         try:
             self.model = self.mjw.put_model(self.spec, batch_sizes=rows)
-            self.data = self.mjw.make_data(self.spec, batch, nconmax=max(contacts, pairs), nccdmax=pairs, njmax=most)
+            self.data = self.mjw.make_data(
+                self.spec, batch, nconmax=max(contacts, pairs), nccdmax=pairs, njmax=most, nvmax=awake
+            )
         except (NotImplementedError, ValueError) as error:
             raise UserError(f"engine warp: {error}") from error
         self.model.opt.warn_overflow = 0  # kept in `data.overflow` all the same
@@ -110,8 +113,18 @@ class Worlds:
         """Begin again, at rest at `qpos`."""
         self.mjw.reset_data(self.model, self.data)
         self.data.qpos.assign(qpos.astype(np.float32))
+        if self.engine.awake is not None:
+            self._fall_asleep()
         for noted in (self.tick, self.fastest, self.off, self.deepest, self.histogram):
             noted.zero_()
+
+    def _fall_asleep(self) -> None:
+        """Put every object to sleep, each by itself."""
+        objects = np.arange(self.spec.ntree - self.mass.shape[1], self.spec.ntree)
+        asleep = self.data.tree_asleep.numpy()  # the next of those that fell asleep together; negative: awake
+        asleep[:, objects] = objects
+        self.data.tree_asleep.assign(asleep)
+        self.data.tree_awake.assign((asleep < 0).astype(np.int32))
 
     def _record(self) -> Any:
         """Record a control period as a graph to replay; False on a GPU that cannot record one."""
@@ -160,7 +173,11 @@ class Worlds:
         return self.depths()
 
     def depths(self) -> np.ndarray:
-        """See `hosted.State`; these are the depths of the last step."""
+        """See `hosted.State`; these are the depths of the last step, but where objects sleep."""
+        if self.engine.config.sleep:  # whose contacts among themselves are not looked for
+            self.mjw.reset_data(self.model, self.data)
+            self.data.qpos.assign(self.qpos.astype(np.float32))
+            self.mjw.fwd_position(self.model, self.data)
         deepest = np.zeros(len(self.qpos))
         count = min(int(self.data.nacon.numpy()[0]), self.data.naconmax)
         contact = self.data.contact
@@ -171,7 +188,7 @@ class Worlds:
     def warning(self) -> np.ndarray:
         """Warnings as in MuJoCo C `[B, W, 2]` (last info, count); lack of room for contacts marks the whole batch."""
         kind, seen = self.mjw.OverflowType, self.data.overflow.numpy()
-        contacts, rows = kind.BROADPHASE | kind.NARROWPHASE | kind.CCD, kind.NEFC | kind.NJMAX_NNZ
+        contacts, rows = kind.BROADPHASE | kind.NARROWPHASE | kind.CCD, kind.NEFC | kind.NJMAX_NNZ | kind.NVMAX
         out = np.zeros((len(seen), int(mujoco.mjtWarning.mjNWARNING), 2), int)
         out[:, int(mujoco.mjtWarning.mjWARN_CONTACTFULL), 1] = (seen & int(contacts)) != 0
         out[:, int(mujoco.mjtWarning.mjWARN_CNSTRFULL), 1] = (seen & int(rows)) != 0
