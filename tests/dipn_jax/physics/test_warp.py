@@ -34,6 +34,7 @@ def test_it_follows_the_native_engine(warp_engine: Any, engine: Any, settled: An
     poses = settled.poses[:2, :objects].copy()
     poses[:, :, 2] += 0.01
     found = primitives.settle(warp_engine, scene, poses, duration=0.06)
+    assert warp_engine._worlds.model.is_sparse == (objects == 5)
     wanted = primitives.settle(engine, scene, poses, duration=0.06)
     np.testing.assert_allclose(found.poses[..., :3], wanted.poses[..., :3], atol=1e-4)
     np.testing.assert_array_equal(found.fault & ~Fault.UNSETTLED, wanted.fault & ~Fault.UNSETTLED)
