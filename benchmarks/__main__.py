@@ -95,6 +95,14 @@ BENCHMARKS = {
     "jobs.overhead": Benchmark(
         "milliseconds, memory and bytes a shard of a data set of many, without physics", "none", "jobs:overhead"
     ),
+    "engines.warp_room": Benchmark(
+        "contacts, touching pairs and rows of MuJoCo Warp: the most of a scene, an object", "none", "warp_room:seen"
+    ),
+    "engines.warp_settings": Benchmark(
+        "other settings of MuJoCo Warp: time over that of its own, millimetres from MuJoCo C after 5 cm, iterations",
+        "none",
+        "warp_settings:settings",
+    ),
     "rates.native": Benchmark("episodes a second of MuJoCo C, 1 to 30 objects", "none", "rates:native"),
     "rates.mjx": Benchmark("episodes a second of MJX, 1 to 30 objects", "none", "rates:mjx"),
     "rates.warp": Benchmark("episodes a second of MuJoCo Warp, 1 to 30 objects", "none", "rates:warp"),

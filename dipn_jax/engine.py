@@ -21,6 +21,7 @@ class PhysicsConfig:
     falling_timestep: float = 0.0  # seconds of a step while objects are dropped (0: as `timestep`); `native` only
     iterations: int = 50
     ls_iterations: int = 50
+    tolerance: float = 1e-8  # MuJoCo Warp, in float32, takes 1e-6 instead of anything smaller
     impratio: float = 10.0  # halves the slip of a lifted object
     cone: str = "elliptic"  # or pyramidal
     solref: str = "0.01 1"  # softer makes grasps wrong

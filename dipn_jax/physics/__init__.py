@@ -96,7 +96,7 @@ def make_engine(
     Args:
       name: engine, or `auto`.
       timestep: seconds of every physics step, instead of the engine's own.
-      sleep: `PhysicsConfig.sleep`, instead of the engine's own; only `native` can.
+      sleep: `PhysicsConfig.sleep`, instead of the engine's own; `native` and `warp` can.
       threads: on which `native` simulates, one a core if not given; no result depends on it.
 
     Raises:

@@ -20,21 +20,15 @@ _FULL_WARNINGS = [int(getattr(mujoco.mjtWarning, f"mjWARN_{name}FULL")) for name
 """Warnings of MuJoCo that contacts or constraints were left out."""
 
 
-class Worlds(Protocol):
-    """A batch of simulations of the gripper and N objects."""
+class State(Protocol):
+    """The state of a batch of simulations of the gripper and N objects."""
 
     qpos: np.ndarray  # [B, 6 + 7 N]
     qvel: np.ndarray  # [B, 6 + 6 N]
-    ctrl: np.ndarray  # [B, 6]
-    qfrc_applied: np.ndarray  # [B, 6 + 6 N]
 
     @property
     def warning(self) -> np.ndarray:
         """Warnings of each kind of mjtWarning: (last info, count) `[B, W, 2]`."""
-        ...
-
-    def advance(self) -> tuple[np.ndarray, np.ndarray]:
-        """Simulate one control period; returns which simulations (indices) failed, and which ran out of memory."""
         ...
 
     def last_depths(self) -> np.ndarray:
@@ -43,6 +37,17 @@ class Worlds(Protocol):
 
     def depths(self) -> np.ndarray:
         """Return the deepest contact `[B]` in metres now."""
+        ...
+
+
+class Worlds(State, Protocol):
+    """A batch that is stepped from the host."""
+
+    ctrl: np.ndarray  # [B, 6]
+    qfrc_applied: np.ndarray  # [B, 6 + 6 N]
+
+    def advance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate one control period; returns which simulations (indices) failed, and which ran out of memory."""
         ...
 
 
@@ -83,7 +88,7 @@ def follow(
 class Watch:
     """Collects faults while a batch runs. A scene that was not finite once counts as broken until the end."""
 
-    def __init__(self, scenes: Scene, sims: Worlds) -> None:
+    def __init__(self, scenes: Scene, sims: State) -> None:
         self.scenes, self.sims = scenes, sims
         batch, slots = scenes.shape.shape
         self.broken, self.full = np.zeros((2, batch), bool)

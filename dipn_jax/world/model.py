@@ -175,7 +175,7 @@ def mjcf(
     return f"""<mujoco model="dipn">
 <compiler angle="radian"/>
 <option timestep="{c.timestep}" integrator="implicitfast" solver="Newton" cone="{c.cone}" impratio="{c.impratio}"
- iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="1e-8" jacobian="{jacobian}"
+ iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="{c.tolerance}" jacobian="{jacobian}"
  sleep_tolerance="{c.sleep}"> <flag multiccd="enable" autoreset="disable"{sleep}/></option>
 <custom><numeric name="max_geom_pairs" data="{pairs}"/>
  <numeric name="max_contact_points" data="{contacts}"/><numeric name="{MARK}" data="1"/>{mark}</custom>
