@@ -47,7 +47,7 @@ def enable_compilation_cache() -> None:
     if home is None:  # as in some containers: nothing is kept
         return
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(home / "xla")
-    settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.5}
+    settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.0}
     for name, value in settings.items():
         if "jax" in sys.modules:
             sys.modules["jax"].config.update(name, value)
