@@ -1,15 +1,15 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html
-# make test   lint, types, tests
+# make test   lint, types, and the tests that take seconds; make test-slow: the others
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
-# make mutants  the table of docs/testing.md (hours)
-# make fuzz, make faults  the counts of docs/reliability.md (hours)
+# make mutants, make fuzz, make faults  the counts of docs/testing.md and docs/reliability.md (hours)
 # make push-figures, grasp-figures, clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
 PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
+PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
-.PHONY: setup demo test lint bench mutants fuzz faults push-figures grasp-figures clear-figures clean-demo
+.PHONY: setup demo test test-slow lint bench mutants fuzz faults push-figures grasp-figures clear-figures clean-demo
 
 setup: .venv/.installed
 .venv/.installed: pyproject.toml constraints.txt
@@ -17,8 +17,8 @@ setup: .venv/.installed
 	$(INSTALL) '.[dev]'
 	touch $@
 
-test: setup lint
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+test: setup lint ; $(PYTEST) -m "not slow"
+test-slow: setup ; $(PYTEST) -m slow
 
 lint: setup
 	$(BIN)/ruff check .

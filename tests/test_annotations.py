@@ -81,6 +81,7 @@ def test_every_annotation_can_be_evaluated() -> None:
             raise AssertionError(f"{name}: {error}") from error
 
 
+@pytest.mark.slow
 def test_nothing_is_checked_outside_of_tests() -> None:
     script = """
         import importlib, pkgutil, sys

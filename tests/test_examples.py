@@ -43,6 +43,7 @@ def test_03_reads_what_it_made() -> None:
     assert 0.01 < found["moved"].max() < 0.2, "a push of 10 cm moves something"
 
 
+@pytest.mark.slow
 def test_04_the_loss_falls() -> None:
     found = run("04")
     assert [point["step"] for point in found["curve"]] == [10, 20, 30]

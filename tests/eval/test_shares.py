@@ -56,6 +56,7 @@ def _parts(folder: pathlib.Path) -> list[pathlib.Path]:
     return [folder / f"part-{shard}-of-{OF}" for shard in range(OF)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", WORDS)
 def test_parts_make_the_very_evaluation_of_one_worker(
     kind: str, evaluated: Callable[[str], pathlib.Path], tmp_path: pathlib.Path

@@ -27,6 +27,7 @@ def saved(run: pathlib.Path, method: str, width: int = 8) -> nnx.Module:
     return model
 
 
+@pytest.mark.slow
 def test_a_compared_method_starts_from_a_run_of_it(engine: Any, tmp_path: pathlib.Path) -> None:
     saved(tmp_path / "begun", "rea")
     initial: Any = checkpoint.load_network(tmp_path / "begun", network="vpg")

@@ -167,6 +167,7 @@ def _flat_scores(images: jax.Array) -> jax.Array:
     return jnp.tile(images[:, None, ..., 3], (1, 16, 1, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["vpg", "rea", "dqn"])
 def test_an_interrupted_run_continues_to_the_same_end(
     method: Any, engine: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch

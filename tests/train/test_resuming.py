@@ -41,6 +41,7 @@ def _state(run: pathlib.Path) -> list[np.ndarray]:
     return [*model.values(), *train.values()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_an_interrupted_run_ends_as_an_uninterrupted_one(
     name: str, data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch

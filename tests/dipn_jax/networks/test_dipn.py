@@ -138,6 +138,7 @@ def test_batch_elements_do_not_interact(forward: Any, inputs: PushInput) -> None
     np.testing.assert_allclose(forward(changed)[1:], forward(inputs)[1:], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_published_form_does_not_depend_on_order_padding_and_neighbours(settled: Any) -> None:
     network = dipn.DIPN(dipn.DipnConfig(preset="paper", stages=(1, 1, 1, 1)), rngs=nnx.Rngs(0))
     network.eval()

@@ -35,6 +35,7 @@ def scores() -> dict[str, Any]:
     return {"decide": decide, "gn": gn}
 
 
+@pytest.mark.slow
 def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled: Any, scores: dict[str, Any]) -> None:
     seen = render.observe(settled.scene, settled.poses)
     many = 0
@@ -49,6 +50,7 @@ def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled
     assert many, "every image was scored whole"
 
 
+@pytest.mark.slow
 def test_rough_means_rank_nearly_as_whole_images_do(settled: Any, scores: dict[str, Any]) -> None:
     seen = render.observe(settled.scene, settled.poses)
     image = np.asarray(jax.vmap(planner.render.rgbd)(seen))

@@ -17,6 +17,7 @@ def _parameters(model: nnx.Module) -> int:
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
 
 
+@pytest.mark.slow
 def test_a_trunk_is_densenet_121() -> None:
     trunk = nnx.eval_shape(lambda: vpg.DenseNet((6, 12, 24, 16), nnx.Rngs(0)))
     assert _parameters(trunk) == 6_953_856  # torchvision's densenet121 without its classifier

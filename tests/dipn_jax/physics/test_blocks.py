@@ -19,6 +19,7 @@ from dipn_jax.physics.mjx_program import Program
 from dipn_jax.structs import Push, Scene
 from dipn_jax.world import clutter, primitives, scenes
 
+pytestmark = pytest.mark.slow
 BLOCKS = 4
 CONTACTS = 9
 ROWS = 3

@@ -24,10 +24,9 @@ from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import model, primitives, scenes, shapes
 
-BATCH = 4
-"""Scenes that the program takes."""
-SLOTS = 3
-"""Object slots of a scene."""
+pytestmark = pytest.mark.slow
+BATCH = 4  # scenes that the program takes
+SLOTS = 3  # object slots of a scene
 POSITION_TOLERANCE = 0.003
 """Metres between the engines after 5 cm of a push: float32 and another solver. On 32 random scenes (docs/world.md) the
 90th percentile is 1.3 mm, as contacts between objects multiply differences."""

@@ -74,6 +74,7 @@ def test_an_object_inside_another_is_a_fault(warp_engine: Any, settled: Any) -> 
     assert [bool(f & Fault.PENETRATION) for f in fault] == [False, True]
 
 
+@pytest.mark.slow
 def test_objects_asleep_wake_when_they_are_touched(warp_engine: Any) -> None:
     """The gripper pushes one cube against another; three rest, in the second scene two of them inside one another."""
     poses = np.tile(np.float32([0, 0, 0.025, 1, 0, 0, 0]), (2, 5, 1))

@@ -100,6 +100,7 @@ def test_values_of_the_compared_methods_are_aided_by_the_same_names(image: Any) 
     assert (low[:, on] <= plain[:, on]).all() and (low[:, on] < plain[:, on]).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_dipn_predicts_once_without_mirrors() -> None:
     builtin = checkpoint.find(pathlib.Path("builtin"), network="dipn")
     label = jnp.full((224, 224), -1).at[100:130, 100:120].set(0).at[100:130, 125:140].set(1)

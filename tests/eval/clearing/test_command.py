@@ -52,6 +52,7 @@ def _load(method: str, networks: Networks, engine: Any, **config: Any) -> Any:
     return lambda *args: decide(*args[:3], lambda _: args[3])[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"])
 def test_every_method_decides_on_every_table_by_itself(
     method: Any, engine: Any, settled: Any, runs: dict[str, pathlib.Path]

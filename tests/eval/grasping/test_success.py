@@ -194,6 +194,7 @@ def test_calibration_error_of_known_scores() -> None:
         assert found["reliability/9/count"] == 10 and found["reliability/9/success"] == held
 
 
+@pytest.mark.slow
 def test_grasp_evaluation_writes_what_it_promises(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:

@@ -26,6 +26,7 @@ def test_learning_curves_show_the_measures_that_exist(tmp_path: pathlib.Path) ->
     assert drawn == {"reward/grasp": [[10, 0.5], [30, 0.75]], "reward/push": [[20, 0.25]]}
 
 
+@pytest.mark.slow
 def test_the_report_is_one_file_with_its_pictures(
     cleared: Any, engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
