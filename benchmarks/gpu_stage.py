@@ -198,10 +198,7 @@ def main() -> None:
     def say(answer: dict[str, Any]) -> None:
         print(json.dumps(answer), file=answers, flush=True)
 
-    import jax
-
     console.enable_compilation_cache()
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # there are hundreds of small programs
     say({"machine": facts()})
     COMPILING.listen()
     for line in sys.stdin:

@@ -29,9 +29,11 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 def costs(kept: dict[str, Any]) -> str:
     """Return the table of what a million episodes cost by kind and number of objects.
 
-    On more cores it is as many times quicker: shards share nothing. `kept` is a file of `python -m benchmarks --out`.
+    On more cores it is as many times quicker: shards share nothing. `kept` is a file of `python -m benchmarks --out`,
+    or several of one machine merged by hand, as `page.origins` takes them.
     """
-    cores, rows = kept["machine"]["cores"], []
+    machines = kept["machine"] if isinstance(kept["machine"], list) else [kept["machine"]]
+    cores, rows = machines[0]["cores"], []
     for name, rate in kept["figures"].items():
         if name.startswith("rates.native/"):
             _, kind, objects = name.split("/")

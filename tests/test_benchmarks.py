@@ -6,7 +6,7 @@ import pathlib
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import page
+from benchmarks import page, scaling
 
 DOCS = pathlib.Path(__file__).parent.parent / "docs"
 
@@ -35,3 +35,21 @@ def test_the_page_in_docs_shows_the_figures_in_docs(name: str) -> None:
     for table in page.tables(kept["figures"]).strip().split("\n\n"):
         assert table in text
     assert page.origins(kept) in text
+
+
+def test_the_page_of_large_data_sets_shows_the_figures_in_docs() -> None:
+    kept, text = json.loads((DOCS / "scaling.json").read_text()), (DOCS / "scaling.md").read_text()
+    for table in (scaling.costs(kept), scaling.overheads(kept), page.origins(kept)):
+        assert table in text
+    hours = kept["machine"][0]["cores"] * scaling.MILLION / kept["figures"]["rates.native/push/7"] / 3600
+    assert f"A million pushes of seven objects cost {hours:.1f} core-hours" in text
+    assert f"takes its driver {kept['figures']['jobs.overhead/launch_milliseconds']:.2g} ms" in text
+
+
+def test_costs_are_of_a_core_and_fall_with_their_number() -> None:
+    kept = {
+        "machine": {"cores": 2},
+        "figures": {"rates.native/push/7": 100.0, "jobs.overhead/ray/1000/milliseconds": 3.0},
+    }
+    # 10,000 s of two cores; 10,000 cores make 500,000 a second, in shards of 500
+    assert "| push | 7 | 100 | 5.56 | 0.056 h | 0.033 min | 1e+03 |" in scaling.costs(kept)
