@@ -35,7 +35,7 @@ Found = Iterator[tuple[str, float | str]]
 
 
 class Wrong(Exception):
-    """Raised where a result is not right; the message is one line that says what came and what was wanted."""
+    """Raised where a result is not right; the message is one line with the result and what it should be."""
 
 
 class NotMeasured(Exception):

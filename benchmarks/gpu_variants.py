@@ -43,7 +43,7 @@ ALL = WARP | MJX
 
 
 def variant(name: str, *, batch: int, timestep: float | None = None) -> Engine:
-    """Return an engine with the settings of `ALL[name]`, for so many scenes at once; and a time step, if one is given.
+    """Return an engine with the settings of `ALL[name]`, for `batch` scenes at once; and a time step, if one is given.
 
     Raises:
       NotMeasured: the engine is not installed, or knows no such setting.

@@ -42,7 +42,7 @@ def seen(setting: Setting) -> Iterator[tuple[str, float]]:
 
 
 def _rollouts(native: Engine, count: int, tries: int, seed: int) -> Iterator[tuple[Scene, Rollout]]:
-    """Drop, push and grasp `tries` scenes of `count` objects; the rollouts have a sample `EVERY` so many seconds."""
+    """Drop, push and grasp `tries` scenes of `count` objects; the rollouts have a sample every `EVERY` seconds."""
     drop, aim = jax.random.split(jax.random.key(seed))
     scene, poses = jax.vmap(lambda key: scenes.random_scene(key, config=scenes.fixed_count(count)))(
         jax.random.split(drop, tries)

@@ -86,8 +86,8 @@ class WarpEngine:
           chunk: most scenes simulated at once; if not given, CHUNK or CHUNK_ON_GPU.
           jacobian: `dense`, `sparse`, or `auto`: sparse above MOST_DENSE_DOF degrees of freedom, as of five objects.
           room: see `Room`; what does not fit is left out, and a fault.
-          awake: for tables at rest, not for drops: objects begin asleep, and there is room for so many of a scene that
-            are awake at once; more are a fault. If not given, all begin awake. Wants `config.sleep`.
+          awake: for tables at rest, not for drops: objects begin asleep, and at most this many of a scene can be awake
+            at once; more are a fault. If not given, all begin awake. Wants `config.sleep`.
 
         Raises:
           UserError: Warp cannot be used, the time step does not divide the control period, or no such Jacobian, chunk,
