@@ -66,6 +66,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_forked_workers_read_and_spawned_ones_render(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
     (tmp_path / "work.py").write_text(SCRIPT)

@@ -33,37 +33,36 @@ def _run(*words: object) -> int:
 
 
 @pytest.fixture(scope="module")
-def evaluated(tiny: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], pathlib.Path]:
-    """Return what makes, once, an evaluation by one worker (`whole`) and by OF of them (`part-I-of-OF`)."""
+def evaluated(
+    tiny: dict[str, pathlib.Path], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., list[pathlib.Path]]:
+    """Return what makes, each once, shards of an evaluation, all if none are named; None: the whole by one worker."""
     root = tmp_path_factory.mktemp("shares")
 
-    def make(kind: str) -> pathlib.Path:
-        folder = root / kind
-        if not folder.exists():
-            words = [kind, *(str(tiny.get(word, word)) for word in WORDS[kind]), "--engine", "native"]
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(push_errors, "GROUP", 2)
-                assert _run(*words, "--out", folder / "whole") == 0
-                for shard in range(OF):
-                    out = folder / f"part-{shard}-of-{OF}"
-                    assert _run(*words, "--shard", shard, "--of", OF, "--threads", 1, "--out", out) == 0
-        return folder
+    def make(kind: str, *shards: int | None) -> list[pathlib.Path]:
+        return [_made(root / kind, kind, shard, tiny) for shard in shards or range(OF)]
 
     return make
 
 
-def _parts(folder: pathlib.Path) -> list[pathlib.Path]:
-    return [folder / f"part-{shard}-of-{OF}" for shard in range(OF)]
+def _made(root: pathlib.Path, kind: str, shard: int | None, tiny: dict[str, pathlib.Path]) -> pathlib.Path:
+    folder = root / ("whole" if shard is None else f"part-{shard}-of-{OF}")
+    share = [] if shard is None else ["--shard", shard, "--of", OF, "--threads", 1]
+    if not folder.exists():
+        words = [kind, *(str(tiny.get(word, word)) for word in WORDS[kind]), "--engine", "native"]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(push_errors, "GROUP", 2)
+            assert _run(*words, *share, "--out", folder) == 0
+    return folder
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", WORDS)
 def test_parts_make_the_very_evaluation_of_one_worker(
-    kind: str, evaluated: Callable[[str], pathlib.Path], tmp_path: pathlib.Path
+    kind: str, evaluated: Callable[..., list[pathlib.Path]], tmp_path: pathlib.Path
 ) -> None:
-    folder = evaluated(kind)
-    assert _run("merge", *reversed(_parts(folder)), "--out", tmp_path / "merged") == 0
-    whole, merged = folder / "whole", tmp_path / "merged"
+    assert _run("merge", *reversed(evaluated(kind)), "--out", tmp_path / "merged") == 0
+    (whole,), merged = evaluated(kind, None), tmp_path / "merged"
     names = sorted(str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file())
     assert names == sorted(str(path.relative_to(merged)) for path in merged.rglob("*") if path.is_file())
     assert "metrics.json" in names and (kind == "prediction" or "episodes/002.npz" in names)
@@ -75,9 +74,9 @@ def test_parts_make_the_very_evaluation_of_one_worker(
 
 
 def test_a_part_that_is_there_is_not_made_again_and_another_is_refused(
-    evaluated: Callable[[str], pathlib.Path], tiny: dict[str, pathlib.Path], capfd: pytest.CaptureFixture[str]
+    evaluated: Callable[..., list[pathlib.Path]], tiny: dict[str, pathlib.Path], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    part = _parts(evaluated("clear"))[0]
+    (part,) = evaluated("clear", 0)
     before = {path: path.stat().st_mtime_ns for path in part.rglob("*")}
     words = ["clear", *(str(tiny.get(word, word)) for word in WORDS["clear"]), "--engine", "native", "--out", part]
     assert _run(*words, "--shard", 0, "--of", OF) == 0
@@ -118,11 +117,11 @@ def _edited(part: pathlib.Path, out: pathlib.Path, change: dict[str, Any]) -> pa
 def test_what_does_not_belong_together_is_one_line(
     change: dict[str, Any],
     says: str,
-    evaluated: Callable[[str], pathlib.Path],
+    evaluated: Callable[..., list[pathlib.Path]],
     tmp_path: pathlib.Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    first, second = _parts(evaluated("clear"))
+    first, second = evaluated("clear")
     capfd.readouterr()
     both = change.pop("both", False)
     if change.get("named", "") is None:
@@ -137,9 +136,9 @@ def test_what_does_not_belong_together_is_one_line(
 
 
 def test_a_damaged_file_of_a_part_is_named(
-    evaluated: Callable[[str], pathlib.Path], tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+    evaluated: Callable[..., list[pathlib.Path]], tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    first, second = _parts(evaluated("clear"))
+    first, second = evaluated("clear")
     damaged = _edited(second, tmp_path / "second", {})
     film = next((damaged / "episodes").iterdir())
     film.write_bytes(film.read_bytes()[:-1])
@@ -162,12 +161,12 @@ def _asked(words: list[str]) -> dict[str, Any]:
 @pytest.mark.parametrize("kind", WORDS)
 def test_a_missing_part_is_named_with_the_command_that_makes_it(
     kind: str,
-    evaluated: Callable[[str], pathlib.Path],
+    evaluated: Callable[..., list[pathlib.Path]],
     tiny: dict[str, pathlib.Path],
     tmp_path: pathlib.Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    only = pathlib.Path(shutil.copytree(_parts(evaluated(kind))[1], tmp_path / "part-1-of-2"))
+    only = pathlib.Path(shutil.copytree(*evaluated(kind, 1), tmp_path / "part-1-of-2"))
     capfd.readouterr()
     assert _run("merge", only, "--out", tmp_path / "out") == 2
     said = capfd.readouterr().err
@@ -199,9 +198,9 @@ def test_shares_that_make_no_sense_are_refused() -> None:
 
 
 def test_other_processors_are_said(
-    evaluated: Callable[[str], pathlib.Path], tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+    evaluated: Callable[..., list[pathlib.Path]], tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    first, second = _parts(evaluated("clear"))
+    first, second = evaluated("clear")
     other = _edited(second, tmp_path / "second", {"processor": "Abacus"})
     merging.together([shares.read(first), shares.read(other)], tmp_path / "out")
     said = capfd.readouterr().err

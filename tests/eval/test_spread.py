@@ -35,6 +35,7 @@ def parts_of_one(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return called
 
 
+@pytest.mark.slow
 def test_tasks_make_the_evaluation_of_one_worker_and_a_second_start_only_what_is_missing(
     parts_of_one: list[int],
     tiny: dict[str, pathlib.Path],

@@ -119,6 +119,7 @@ def test_tests_that_say_nothing_of_a_module_are_refused(tmp_path: pathlib.Path, 
         assert (tmp_path / "module.py").read_text() == "X = 1\n"
 
 
+@pytest.mark.slow
 def test_a_mutant_is_killed_by_a_failure_and_by_time(tmp_path: pathlib.Path) -> None:
     for name, body in (("good", "assert True"), ("bad", "assert False"), ("endless", "while True: pass")):
         (tmp_path / f"test_{name}.py").write_text(f"def test_it() -> None:\n    {body}\n")

@@ -72,6 +72,7 @@ def _refuse(constant: str) -> None:
     raise AssertionError(f"{constant} is no JSON")
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_ends_a_run_at_the_last_finite_checkpoint(
     task: PushTask, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,6 +14,7 @@ from dipn_jax.storage import checkpoint
 from dipn_jax.world import scenes
 
 
+@pytest.mark.slow
 def test_the_refusal_of_more_steps_says_how_and_a_run_starts_from_another(
     data: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:

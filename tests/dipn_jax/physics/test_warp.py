@@ -28,6 +28,7 @@ def warp_engine() -> Any:
     return physics.make_engine("warp")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objects", [5, 2], ids=["sparse", "dense"])
 def test_it_follows_the_native_engine(warp_engine: Any, engine: Any, settled: Any, objects: int) -> None:
     scene = jax.tree.map(lambda leaf: leaf[:2, :objects], settled.scene)
@@ -40,6 +41,7 @@ def test_it_follows_the_native_engine(warp_engine: Any, engine: Any, settled: An
     np.testing.assert_array_equal(found.fault & ~Fault.UNSETTLED, wanted.fault & ~Fault.UNSETTLED)
 
 
+@pytest.mark.slow
 def test_a_position_that_is_not_finite_or_outside_is_a_fault_of_its_own_episode(warp_engine: Any, settled: Any) -> None:
     scene, poses = structs.take(settled.scene, np.array([0, 1, 1])), settled.poses[[0, 1, 1]].copy()
     poses[0, 0, 2] = np.nan
@@ -50,6 +52,7 @@ def test_a_position_that_is_not_finite_or_outside_is_a_fault_of_its_own_episode(
     assert fault[2] & ~Fault.UNSETTLED == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", [(1, 1, 64), (16, 4, 1)], ids=["contacts", "rows"])
 def test_lack_of_room_is_a_fault(settled: Any, room: tuple[int, int, int]) -> None:
     scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2]
@@ -64,6 +67,7 @@ def test_settings_that_cannot_be_are_refused_in_one_line(options: dict[str, Any]
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_an_object_inside_another_is_a_fault(warp_engine: Any, settled: Any) -> None:
     scene, poses = structs.take(settled.scene, slice(0, 2)), settled.poses[:2].copy()
     cubes = scene.replace(shape=np.zeros_like(scene.shape), size=np.full_like(scene.size, 0.05))

@@ -16,6 +16,7 @@ from dipn_jax.storage import checkpoint
 from dipn_jax.world import primitives
 
 
+@pytest.mark.slow
 def test_the_builtin_push_network_predicts_pushes_well(settled: Any, engine: Any) -> None:
     """On three scenes of five objects its error is far below that of no motion."""
     scene, poses = structs.take(settled.scene, slice(0, 3)), settled.poses[:3]

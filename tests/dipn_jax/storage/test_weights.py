@@ -61,7 +61,9 @@ def outputs(network: str, model: Any, arrays: dict[str, np.ndarray], sizes: dict
     return {"motions": model(push_frame.PushInput(**given), distances)}
 
 
-@pytest.mark.parametrize("kind", CONFIGS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if "paper" in kind else ()) for kind in CONFIGS]
+)
 def test_a_file_holds_every_array_and_says_what_goes_in_and_out(kind: str, tmp_path: pathlib.Path) -> None:
     network, config = CONFIGS[kind]
     model = saved(tmp_path / "run", network, config)

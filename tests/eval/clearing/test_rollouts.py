@@ -73,6 +73,7 @@ def _decide(tables: SettledScene, engine: Records) -> Decision:
     return decision
 
 
+@pytest.mark.slow
 def test_the_engine_is_not_told_masses_and_frictions(tables: SettledScene) -> None:
     engine = Records()
     decision = _decide(tables, engine)
