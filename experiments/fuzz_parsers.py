@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from dipn_jax.eval import curves, metrics
+from dipn_jax.eval import curves, merging, metrics, shares
 from dipn_jax.eval.clearing import film
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.report import comparison
@@ -156,6 +156,25 @@ def _report(folder: pathlib.Path) -> None:
     comparison.results_and_causes([one])
 
 
+def _save_part(folder: pathlib.Path) -> None:
+    """Write an evaluation of one table as its only part."""
+    _save_cleared(folder)
+    names = ["episodes.json", "episodes/000.npz"]
+    given = files.read_json(folder / "settings.json")
+    share, words = shares.Share(0, 1), ["--method", "gn"]
+    shares.write(
+        folder, "clear", share, total=1, command=words, given=given, partial=_state(folder), names=names, about={}
+    )
+
+
+def _merge_part(folder: pathlib.Path) -> None:
+    """Put the part together with no other, and read the whole as a report does."""
+    part = shares.read(folder)
+    merging.check([part])
+    merging.write([part], folder / "whole")
+    _report(folder / "whole")
+
+
 def _network(folder: pathlib.Path) -> None:
     """Copy the network that comes with the package."""
     shutil.copytree(checkpoint.find(pathlib.Path("builtin"), network="grasp"), folder, dirs_exist_ok=True)
@@ -208,6 +227,7 @@ def _parsers() -> list[Parser]:
         Parser("state", "partial.npz", _save_state, _load_state, fuzzing.mutate_arrays),
         Parser("film", "episodes/000.npz", _save_cleared, _film, fuzzing.mutate_arrays),
         Parser("episodes", "episodes.json", _save_cleared, _report, tree),
+        Parser("part", shares.PART, _save_part, _merge_part, tree),
         Parser("settings", "settings.json", _save_cleared, _report, tree),
         Parser("metrics", "metrics.json", _save_cleared, _report, tree),
         Parser("log", "metrics.jsonl", _log, lambda at: curves.load_grasp_runs([at]), lines),
