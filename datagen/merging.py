@@ -38,13 +38,18 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> None:
     """Join data sets in the folder `out`.
 
     Raises:
-      UserError: one is missing or damaged, they are of several kinds or numbers of slots, episodes were made twice, or
-        the folder holds something else.
+      UserError: one is missing or damaged, they are of several kinds or numbers of slots or have too many shards,
+        episodes were made twice, or the folder holds something else.
     """
     if out in folders or len(set(folders)) < len(folders):
         raise UserError(f"merge: {out if out in folders else folders[0]} is named twice; want each folder once")
     sets = {folder: _entries(folder) for folder in folders}
     entries = [entry for some in sets.values() for entry in some]
+    if len(entries) > shards.MOST_SHARDS:
+        raise UserError(
+            f"merge: {len(entries)} shards, more than their names can number ({shards.MOST_SHARDS}); leave the data "
+            "sets apart: training takes several folders: --data A B"
+        )
     _require_one({entry.path: entry.meta["kind"] for entry in entries}, "kind")
     widths = {entry.path: entry.meta["columns"]["scene.shape"]["shape"][0] for entry in entries}
     _require_one(widths, "number of object slots", "; training takes several folders: --data A B")

@@ -126,7 +126,11 @@ def test_an_interrupted_merge_continues(
 
 
 def test_what_cannot_be_joined_is_one_line(
-    data: Data, other: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+    data: Data,
+    other: pathlib.Path,
+    tmp_path: pathlib.Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def refused(says: str, *words: object) -> None:
         capsys.readouterr()
@@ -155,6 +159,9 @@ def test_what_cannot_be_joined_is_one_line(
     wider = write(tmp_path / "wider", [split.widened(episodes, 4)], {"seed": 9})
     files.write_json(wider / "config.json", JOB.describe())
     refused("has number of object slots 3", push, wider, *out)
+    with monkeypatch.context() as patch:
+        patch.setattr(shards, "MOST_SHARDS", 2)
+        refused("3 shards, more than their names can number (2)", push, other, *out)
     assert not (tmp_path / "j").exists()
     refused("holds another data set", push, other, "--out", wider)
     (wider / "config.json").unlink()
