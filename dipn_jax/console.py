@@ -236,7 +236,7 @@ def exit_code(work: Callable[[], int | None]) -> int:
         print(f"error: {addresses.named(str(error))}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"error: {addresses.named(mended(error))}", file=sys.stderr)
+        print(f"error: {UserError(addresses.named(mended(error)))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted: run the same command again to continue from here", file=sys.stderr)

@@ -12,3 +12,8 @@ class UserError(Exception):
       except dipn_jax.UserError as error:
           print(error)        # --method vpg: needs --value-net; give a run of dipn-train baseline
     """
+
+    def __init__(self, text: str) -> None:
+        """Keep the text on one line: what cannot be printed, as a line break in the name of a file, is shown as ?."""
+        text = text.encode("utf-8", "backslashreplace").decode()
+        super().__init__("".join(c if c.isprintable() else "?" for c in text))

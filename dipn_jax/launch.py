@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import os
 import signal
+import socket
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, Literal
 
@@ -19,6 +20,8 @@ from dipn_jax.interruption import STOPS
 
 AHEAD = 2
 """Tasks that are submitted for each one that the cluster can run at a time."""
+ANSWERS_WITHIN = 20.0
+"""Seconds within which a cluster has to accept a connection."""
 RETRIES = 16
 """Times that a task is run again whose process or machine died: machines come and go, but a task can be at fault."""
 STORE_BYTES = 100 * 2**20
@@ -129,6 +132,19 @@ def _warn_of_too_little(ray: Any, launch: Launch) -> None:
         console.warn(f"no machine of the cluster has {launch.num_cpus:g} cores and {launch.num_gpus:g} GPUs; waiting")
 
 
+def _require_answer(address: str | None) -> None:
+    """Raise a UserError if nothing answers at HOST:PORT, for which Ray would wait many minutes."""
+    host, _, port = (address or "").rpartition(":")
+    if not port.isdigit() or "/" in host:  # none, `auto`, `local` or ray://...
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), ANSWERS_WITHIN).close()
+    except (OSError, OverflowError) as error:
+        raise UserError(
+            f"--launcher ray: no cluster at RAY_ADDRESS={address} ({error}); start one with `ray start --head`"
+        ) from None
+
+
 @contextlib.contextmanager
 def _connected() -> Iterator[Any]:
     """Return Ray, connected to a cluster within a `with` statement."""
@@ -143,6 +159,7 @@ def _connected() -> Iterator[Any]:
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *STOPS)}
     quiet = {"log_to_driver": False, "logging_level": "ERROR"}
     address = os.environ.get("RAY_ADDRESS")
+    _require_answer(address)
     try:
         if address:
             ray.init(address, **quiet)

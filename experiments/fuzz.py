@@ -66,7 +66,7 @@ def fuzz(parser: Parser, inputs: int, folder: pathlib.Path, *, seed: int = 0) ->
     """Give a parser `inputs` mutations of its valid file.
 
     Raises:
-      UserError: the valid file is not accepted.
+      RuntimeError: the valid file is not accepted.
     """
     begun = time.perf_counter()
     parser.prepare(folder)
@@ -74,7 +74,7 @@ def fuzz(parser: Parser, inputs: int, folder: pathlib.Path, *, seed: int = 0) ->
     valid = path.read_bytes()
     kind, said = outcome(parser, folder)
     if kind != "accepted":
-        raise UserError(f"{parser.name}: its valid file is not accepted: {said}")
+        raise RuntimeError(f"{parser.name}: its valid file is not accepted: {said}")
     counts, failures = collections.Counter(dict.fromkeys(OUTCOMES, 0)), dict[str, str]()
     with console.Progress(parser.name, inputs, unit="inputs") as progress:
         for number in range(inputs):

@@ -40,6 +40,20 @@ def _one_line(result: tuple[int, str], says: str) -> None:
     assert "Traceback" not in error
 
 
+def test_a_name_with_a_line_break_is_quoted_on_one_line(call, tmp_path: pathlib.Path) -> None:
+    named = tmp_path / "a\nb.json"
+    _one_line(call("eval", "clear", "--method", "gn", "--cases", named, "--out", tmp_path / "c"), "a?b.json")
+    named.write_text("{}")
+    _one_line(call("eval", "merge", named, "--out", tmp_path / "c"), "a?b.json")
+
+
+def test_a_disk_that_names_a_file_with_a_line_break_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    def work() -> None:
+        raise OSError(28, "No space left on device", "a\nb")
+
+    _one_line((console.exit_code(work), capfd.readouterr().err), "a?b: No space left")
+
+
 def test_a_negative_count(call, tmp_path: pathlib.Path) -> None:
     _one_line(call("datagen", "push", "--out", tmp_path / "d", "--episodes", "-5"), "--episodes -5")
     assert not (tmp_path / "d").exists()

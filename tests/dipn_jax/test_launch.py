@@ -1,5 +1,6 @@
 """Tasks that are lost are run again, and a user's mistake ends the job; with a stand-in for Ray."""
 
+import socket
 import sys
 import types
 from typing import Any
@@ -98,6 +99,18 @@ def test_without_ray_a_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"--launcher ray: Ray is not installed; pip install 'dipn-jax\[ray\]'"):
         list(launch.run(_double, [(1,)], launch=Launch("ray")))
+
+
+@pytest.mark.parametrize("where", ["127.0.0.1:{port}", "[::1]:{port}", "localhost:99999"])
+def test_a_cluster_that_does_not_answer_is_not_waited_for(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in = _Ray()
+    stand_in.is_initialized = lambda: False  # type: ignore[method-assign]
+    monkeypatch.setitem(sys.modules, "ray", stand_in)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))  # bound, and nobody listens
+        monkeypatch.setenv("RAY_ADDRESS", where.format(port=free.getsockname()[1]))
+        with pytest.raises(UserError, match=r"no cluster at RAY_ADDRESS=.*; start one with"):
+            list(launch.run(_double, [(1,)], launch=Launch("ray")))
 
 
 def test_a_task_has_as_many_threads_as_cores() -> None:

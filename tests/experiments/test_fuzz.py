@@ -106,7 +106,7 @@ def test_outcomes_are_counted_as_they_are(tmp_path: pathlib.Path) -> None:
     assert sum(found.outcomes.values()) == 200 and found.outcomes["tracebacks"] > 0 and found.outcomes["refused"] > 0
     assert any("KeyError: 'x'" in each for each in found.failures)
     assert found.outcomes == fuzz.fuzz(_parser(read), 200, tmp_path).outcomes, "seeded"
-    with pytest.raises(UserError, match="its valid file is not accepted"):
+    with pytest.raises(RuntimeError, match="its valid file is not accepted"):
         fuzz.fuzz(_parser(lambda folder: [][0]), 1, tmp_path)
 
 
