@@ -233,12 +233,12 @@ def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] 
     path, mine = out / "config.json", json.loads(json.dumps(identity))
     if path.exists():
         theirs = read_json(path)
-        different = [key for key in mine if key not in free and theirs.get(key) != mine[key]]
+        different = [key for key in {**mine, **theirs} if key not in free and theirs.get(key) != mine.get(key)]
         if different:
             key = different[0]
             begun = typed.one_line(str(theirs.get(key)), most=200)
             raise UserError(
-                f"{out}: begun with {key}={begun}, asked for {key}={mine[key]}; give another --out, or the "
+                f"{out}: begun with {key}={begun}, asked for {key}={mine.get(key)}; give another --out, or the "
                 "same options and data to continue"
             )
     write_json(path, mine)

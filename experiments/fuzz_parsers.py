@@ -26,6 +26,8 @@ from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import cases
 from experiments import fuzzing, runs
 
+CONFIG = {"kind": "push", "episodes": 6, "shard_size": 2, "seed": 0, "distances": [0.1], "weights": ""}
+"""The configuration of a data set."""
 FRESH = object()
 """A state that stands for none."""
 
@@ -67,7 +69,7 @@ def episodes(kind: str, *, count: int = 2, slots: int = 3) -> Any:
 def data_set(folder: pathlib.Path, *, kind: str = "push", number: int = 2) -> None:
     """Write a data set of `number` shards with two episodes each, of which one shard more was asked for."""
     folder.mkdir(parents=True, exist_ok=True)
-    config = {"kind": kind, "episodes": 2 * number + 2, "shard_size": 2, "seed": 0, "distances": [0.1], "weights": ""}
+    config = {**CONFIG, "kind": kind, "episodes": 2 * number + 2}
     for index in range(number):
         shards.write_shard(folder, index, episodes(kind), kind=kind, config=config, faults={"dropped_scenes": 1})
     files.write_json(folder / "config.json", config)
@@ -245,7 +247,7 @@ def _configuration(folder: pathlib.Path) -> None:
     """Read a configuration as accounting does, and as a command does that goes on with its data set."""
     records.missing(folder)
     begun = files.read_json(folder / "config.json")
-    files.claim(folder, {"kind": "push", "episodes": begun["episodes"], "seed": 0}, free=("episodes",))
+    files.claim(folder, {**CONFIG, "episodes": begun["episodes"]}, free=("episodes",))
 
 
 def _missing(folder: pathlib.Path) -> None:

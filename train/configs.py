@@ -33,6 +33,9 @@ class TrainConfig:
     rises in the first epoch and falls to a tenth after each third of the steps."""
     seed: int = 0
     """Seed of weights, order and augmentation."""
+    mix: tuple[float, ...] = ()
+    """For each folder of --data, how much of every batch is taken from it (3 1: three quarters from the first); an
+    epoch then ends for each by itself. Without it, every example is seen once an epoch."""
     eval_every: int = 200
     """Steps between points of the learning curve."""
     save_every: int = 200

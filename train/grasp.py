@@ -60,7 +60,7 @@ class PretrainTask:
     def __init__(self, data: Folders, config: grasp.GraspConfig) -> None:
         sides = load_sides(data, kind="images")
         self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
-        self.size = len(self.train_set.fault)
+        self.size, self.parts = len(self.train_set.fault), sides.parts
         self.examples = self.size + len(self.test_set.fault)
         self.network_config = config
 
@@ -202,6 +202,7 @@ class GraspTask:
         sides = load_sides(data, kind="grasp")
         self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
         self.size = self.examples = len(self.train_set.fault)
+        self.parts = sides.parts
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
         self._kept = self._keeper(self.train_set, room)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import logging
 import pathlib
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -21,12 +20,9 @@ from dipn_jax.errors import UserError
 from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner, saving
 
-from . import devices, finite, log, precision, profiling
+from . import devices, finite, log, order, precision, profiling
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig
 from .optimizers import make_optimizer
-
-logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
-import grain  # noqa: E402
 
 
 class Taught(Protocol):
@@ -43,6 +39,7 @@ class Task(Taught, Protocol):
     network: str  # key of checkpoint.NETWORKS
     network_config: Any
     size: int  # training examples
+    parts: tuple[int, ...]  # training examples of each data set, in their order
     examples: int  # what a learning curve counts
     fingerprint: str  # of the data
 
@@ -135,6 +132,7 @@ def fit(
         a weight is not finite, after which nothing is saved.
     """
     _check(config, compute, out)
+    order.batches(task.parts, config)  # raises where the mix is wrong, before anything is made
     where = devices.placement(compute, batch=config.batch)
     optimizer = make_optimizer(config, examples=task.size)
     if compute.compile_only:
@@ -160,12 +158,12 @@ def _fit(
     moments, begin = _resume(out, model, optimizer)
     graph, *state = _split(model)
     params, rest, moments = where.everywhere((*state, moments))
-    order = grain.MapDataset.range(task.size).shuffle(seed=config.seed).repeat().batch(config.batch)
+    batches = order.batches(task.parts, config)
     step_fn = make_step(task, graph, optimizer, compute=compute)
     curve = log.Log(out, begin, batch=config.batch, writes=where.leads)
     key = seeds.key(config.seed, seeds.Purpose.TRAINING)
     latest: dict[str, float] = {}
-    watch = finite.Watch(config.learning_rate, lambda k: np.asarray(order[k]), "the last finite checkpoint is kept")
+    watch = finite.Watch(config.learning_rate, lambda k: np.asarray(batches[k]), "the last finite checkpoint is kept")
 
     def save(step: int) -> None:
         here = where.here((params, rest))
@@ -180,7 +178,7 @@ def _fit(
     with progress, Interruption() as interruption, saver, profiled:
         while step < config.steps:
             profiled.see(step)
-            batch = where.share(task.fetch(where.rows(np.asarray(order[step]))))
+            batch = where.share(task.fetch(where.rows(np.asarray(batches[step]))))
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
             watch.see(step, where.here(loss))
             step += 1
@@ -258,10 +256,13 @@ def _identity(task: Task, config: TrainConfig, compute: Compute, initial: nnx.Mo
     """Return everything that determines the run; a flat dictionary, so that a difference can be named."""
     learnt = {name: getattr(compute, name) for name in ("accumulate", "precision")}
     unusual = {name: value for name, value in learnt.items() if value != getattr(DEFAULT_COMPUTE, name)}
+    how = dataclasses.asdict(config)
+    if not how["mix"]:
+        del how["mix"]
     start = None if initial is None else checkpoint.digest(initial)
     network = {f"network.{k}": v for k, v in dataclasses.asdict(task.network_config).items()}
     data = {"network": task.network, "initial_weights": start, "data": task.fingerprint}
-    return {**data, **network, **dataclasses.asdict(config), **unusual}
+    return {**data, **network, **how, **unusual}
 
 
 def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> None:

@@ -76,6 +76,7 @@ class PushTask:
         self.train_set = structs.take(learnt, slice(0, count))
         self.network_config = config
         self.size = self.examples = count
+        self.parts = _within(sides.parts, count)
         masks = ("found",) if found else ()
         self.fingerprint = ":".join(map(str, (sides.fingerprint, count, centimetres, *without, *masks)))
         self.centimetres = np.array(centimetres, np.int32)
@@ -167,6 +168,12 @@ class PushTask:
             total["held_out_loss"].append((self._share * float(loss), int(weight.sum())))
             total["moved_error_mm"].append((float(error), float(moved)))
         return {name: sum(v * w for v, w in rows) / max(sum(w for _, w in rows), 1e-9) for name, rows in total.items()}
+
+
+def _within(parts: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """Return how many of the first `count` examples are of each data set, if `parts` are all of each."""
+    begins = np.cumsum([0, *parts[:-1]])
+    return tuple(int(np.clip(count - begin, 0, part)) for begin, part in zip(begins, parts, strict=True))
 
 
 def _chosen(

@@ -26,6 +26,7 @@ class Sides:
 
     learnt: Any  # [B]
     held_out: Any  # [B]: the last tenth of each data set
+    parts: tuple[int, ...]  # number of those learnt of each data set
     fingerprint: str
 
     @property
@@ -55,7 +56,8 @@ def load_sides(
     chosen = [choose(widened(episodes, slots), folder) for (episodes, _), folder in zip(loaded, folders, strict=True)]
     sides = [split(episodes, folder) for episodes, folder in zip(chosen, folders, strict=True)]
     learnt, held = sides[0] if len(sides) == 1 else map(structs.concatenate, map(list, zip(*sides, strict=True)))
-    return Sides(learnt, held, ":".join(fingerprint for _, fingerprint in loaded))
+    parts = tuple(len(some.scene.shape) for some, _ in sides)
+    return Sides(learnt, held, parts, ":".join(fingerprint for _, fingerprint in loaded))
 
 
 def widened(episodes: Any, slots: int) -> Any:

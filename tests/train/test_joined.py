@@ -4,12 +4,13 @@ import pathlib
 
 import numpy as np
 import pytest
-from dipn_jax.train import cli
+from dipn_jax.train import cli, loop
+from dipn_jax.train.configs import DEFAULT_COMPUTE, TrainConfig
 from dipn_jax.train.grasp import PretrainTask
 from dipn_jax.train.push import PushTask
 from dipn_jax.train.split import load_sides, widened
 
-from dipn_jax import console, structs
+from dipn_jax import console, files, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
@@ -62,5 +63,19 @@ def test_the_command_takes_several_folders_and_names_the_one_that_is_wrong(
     words = ["push", "--data", str(wider["push"]), str(data["grasp"]), "--out", str(tmp_path / "r")]
     assert console.run("dipn-train", cli.COMMANDS, words) == 2
     assert "holds grasp episodes, want push" in capsys.readouterr().err
+    words[3] = str(data["push"])
+    assert console.run("dipn-train", cli.COMMANDS, [*words, "--mix", "1"]) == 2
+    assert "--mix 1: want a number for each folder of --data, 2" in capsys.readouterr().err
+    assert not (tmp_path / "r" / "config.json").exists()
     with pytest.raises(UserError, match="want at least one folder of dipn-datagen push"):
         load_sides((), kind="push")
+
+
+def test_a_mix_belongs_to_a_run_and_runs_without_one_go_on(data: Data, tmp_path: pathlib.Path) -> None:
+    task = PushTask((data["push"], data["push"]), DipnConfig(), limit=None, centimetres=(5,))
+    plain, mixed = (loop._identity(task, TrainConfig(mix=mix), DEFAULT_COMPUTE, None) for mix in ((), (1.0, 3.0)))
+    assert {**mixed, "mix": ()} == {**plain, "mix": ()} and "mix" not in plain
+    files.claim(tmp_path, mixed)
+    files.claim(tmp_path, mixed)
+    with pytest.raises(UserError, match="mix"):
+        files.claim(tmp_path, plain)
