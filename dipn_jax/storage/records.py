@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import hashlib
 import json
 import pathlib
@@ -10,11 +11,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import console, files
+from dipn_jax import console, files, machine
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, manifest, mirror, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
+
+MANY = 100
+"""Shards that take so long to read that it is shown how far that is."""
 
 
 def _problem(path: pathlib.Path, entry: dict[str, Any]) -> str:
@@ -40,7 +44,9 @@ def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
     Those that the manifest does not list are read to their end.
     """
     listed = manifest.listed(folder)
-    checked = [(folder / name, _problem(folder / name, entry)) for name, entry in listed.items()]
+    paths = [folder / name for name in listed]
+    with concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool:
+        checked = list(zip(paths, pool.map(_problem, paths, listed.values()), strict=True))
     checked += [(path, _unreadable(path)) for path in manifest.unlisted(folder, listed)]
     return [(path, what) for path, what in checked if what]
 
@@ -162,12 +168,35 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
       UserError: no such data set, a shard is missing or damaged, or it holds another kind.
     """
     found = checked(folder, kind=kind)
-    parts = [shards.read_shard(folder / name, kind=kind) for name in found]
-    widths = {part.scene.shape.shape[1] for part in parts}
-    if len(widths) > 1:
-        raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
-    episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return episodes, fingerprint(found)
+    return _joined({folder / name: entry["episodes"] for name, entry in found.items()}, kind=kind), fingerprint(found)
+
+
+def _joined(counts: dict[pathlib.Path, int], *, kind: str) -> Any:
+    """Return the episodes of shards, read on all cores, one after another in the order of the shards.
+
+    Args:
+      counts: number of episodes of each.
+      kind: of the episodes.
+    """
+    (path, *_), ends = counts, np.cumsum(list(counts.values()))
+    first = shards.read_shard(path, kind=kind)
+    whole = jax.tree.map(lambda leaf: np.empty((ends[-1], *leaf.shape[1:]), leaf.dtype), first)
+    slots = first.scene.shape.shape[1]
+
+    def put(path: pathlib.Path, end: int) -> None:
+        part = shards.read_shard(path, kind=kind)
+        if (its := part.scene.shape.shape[1]) != slots:
+            raise UserError(
+                f"data set {path.parent}: shards with {sorted((slots, its))} object slots; want one number in a folder"
+            )
+        for leaf, read in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
+            leaf[end - counts[path] : end] = read
+        progress.advance(1)
+
+    progress = console.Progress(f"read {kind}", len(counts), unit="shards", quiet=len(counts) < MANY)
+    with progress, concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool:
+        list(pool.map(put, counts, ends))
+    return whole
 
 
 def fingerprint(entries: dict[str, Any]) -> str:
