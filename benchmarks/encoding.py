@@ -99,6 +99,16 @@ def writing_rate(objects: int, episodes: int, *, shards: int, few: int, seed: in
         return task.episodes / seconds(lambda: make_data(task))
 
 
+def reading_rate(objects: int, episodes: int, *, shards: int, few: int, seed: int) -> float:
+    """Measure the push episodes a second that a training reads, checks and decodes, of files just written."""
+    made = synthetic(real(objects, few, seed), episodes, seed)
+    task = job(objects, episodes, shards=shards, seed=seed)
+    with tempfile.TemporaryDirectory() as name, quiet(), mock.patch.object(generate, "shard", lambda *_: (made, {})):
+        folder = pathlib.Path(name) / "data"
+        generate.generate(task, folder)
+        return task.episodes / seconds(lambda: records.load(folder, kind="push"))
+
+
 def make_without_physics(task: generate.Job) -> int:
     """Make a data set as `harness.make_data` does, with `Resting` as its engine."""
     with mock.patch.object(generate, "make_engine", lambda *_, **__: Resting()):
@@ -113,7 +123,8 @@ def pipeline_rate(objects: int, episodes: int, *, shards: int, seed: int) -> flo
 
 
 def encoding(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Measure `datagen.encoding`, `writing_rate` of seven objects, and `/without_physics`, `pipeline_rate`."""
-    many, few = setting.pick(2000, 8000), setting.pick(200, 2000)
+    """Measure `datagen.encoding`, `writing_rate` of seven objects, `/without_physics`, `pipeline_rate`, and `/read`."""
+    many, few, files = setting.pick(2000, 8000), setting.pick(200, 2000), setting.pick(20, 200)
     yield "datagen.encoding", writing_rate(OBJECTS, many, shards=4, few=48, seed=setting.seed)
     yield "datagen.encoding/without_physics", pipeline_rate(OBJECTS, few, shards=2, seed=setting.seed)
+    yield "datagen.encoding/read", reading_rate(OBJECTS, 500, shards=files, few=48, seed=setting.seed)
