@@ -22,7 +22,7 @@ from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
 from .example_store import IN_MEMORY, Kept, Room
-from .split import Folders, load_sides
+from .split import Folders, first, load_sides
 
 
 @flax.struct.dataclass
@@ -68,12 +68,8 @@ class PushTask:
             return _chosen(episodes, folder, centimetres, without)
 
         sides = load_sides(data, kind="push", choose=choose)
-        learnt, self.test_set = sides.learnt, sides.held_out
-        count = len(learnt.fault)
-        if limit is not None and not 1 <= limit <= count:
-            raise UserError(f"--limit {limit}: want 1 to {count}, the pushes of --data that are not held out")
-        count = count if limit is None else limit
-        self.train_set = structs.take(learnt, slice(0, count))
+        self.train_set, self.test_set = first(sides.learnt, limit, what="pushes"), sides.held_out
+        count = len(self.train_set.fault)
         self.network_config = config
         self.size = self.examples = count
         masks = ("found",) if found else ()

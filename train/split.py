@@ -58,6 +58,18 @@ def load_sides(
     return Sides(learnt, held, ":".join(fingerprint for _, fingerprint in loaded))
 
 
+def first(learnt: Any, limit: int | None, *, what: str) -> Any:
+    """Return the first `limit` of the episodes `learnt [B]`, or all where there is no limit.
+
+    Raises:
+      UserError: there are fewer; `what` says of what.
+    """
+    count = len(learnt.fault)
+    if limit is not None and not 1 <= limit <= count:
+        raise UserError(f"--limit {limit}: want 1 to {count}, the {what} of --data that are not held out")
+    return structs.take(learnt, slice(0, limit))
+
+
 def widened(episodes: Any, slots: int) -> Any:
     """Return episodes `[B, N]` as `[B, slots]`, so that data sets of different numbers of objects can be joined."""
     more = slots - episodes.scene.shape.shape[1]
