@@ -1,4 +1,4 @@
-"""The program `dipn-train`: push, grasp-pretrain, grasp, grasp-online, baseline, export."""
+"""The program `dipn-train`: push, grasp-pretrain, grasp, grasp-online, baseline, sweep, export."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from dipn_jax.addresses import Place
 
 from .acting_commands import baseline, grasp_online, say
 from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig
+from .sweep_command import sweep
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -232,6 +233,7 @@ COMMANDS = {
     "grasp": grasp,
     "grasp-online": grasp_online,
     "baseline": baseline,
+    "sweep": sweep,
     "export": export,
 }
 """The commands of `dipn-train`, by name."""
