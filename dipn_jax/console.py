@@ -131,6 +131,11 @@ def say(text: str) -> None:
     print(addresses.named(text), flush=True)
 
 
+def note(text: str) -> None:
+    """Print one line for the user on standard error, about how far work is."""
+    print(addresses.named(text), file=sys.stderr, flush=True)
+
+
 def warn(text: str) -> None:
     """One line for the user, on standard error, about what goes on in spite of it."""
     print(f"warning: {addresses.named(text)}", file=sys.stderr, flush=True)

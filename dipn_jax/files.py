@@ -219,13 +219,14 @@ def read_lines(path: pathlib.Path, *, wanted: typed.Form = dict) -> list[Any]:
     return found
 
 
-def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = ()) -> None:
+def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] = (), write: bool = True) -> None:
     """Write `out/config.json`, or check that the folder was begun with the same one.
 
     Args:
       out: folder of a data set or a run.
       identity: JSON-able, flat: everything the content depends on.
       free: keys that may change.
+      write: not only check.
 
     Raises:
       UserError: the folder was begun with something else.
@@ -241,7 +242,8 @@ def claim(out: pathlib.Path, identity: dict[str, Any], *, free: tuple[str, ...] 
                 f"{out}: begun with {key}={begun}, asked for {key}={mine.get(key)}; give another --out, or the "
                 "same options and data to continue"
             )
-    write_json(path, mine)
+    if write:
+        write_json(path, mine)
 
 
 def remove_folder(folder: pathlib.Path) -> None:

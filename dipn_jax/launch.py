@@ -33,7 +33,7 @@ class Launch:
     """Where a job runs."""
 
     launcher: Literal["local", "ray"] = "local"
-    """local: in this process; ray: as tasks of the cluster at RAY_ADDRESS, or of one started on this machine."""
+    """local: on this machine, without Ray; ray: as tasks of the cluster at RAY_ADDRESS, or of one started here."""
     num_cpus: float = 1.0
     """Cores that ray reserves for each task; native simulates on as many threads, unless --threads says otherwise."""
     num_gpus: float = 0.0
@@ -60,7 +60,7 @@ LOCAL = Launch()
 
 
 def run(
-    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, launch: Launch
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], *, launch: Launch, fresh: bool = False
 ) -> Generator[tuple[int, Any], None, None]:
     """Call `function(*task)` for every task, on the cluster; yield number and result of each as it ends.
 
@@ -68,6 +68,7 @@ def run(
       function: of a module of this package, which every machine of the cluster has.
       tasks: arguments of each call.
       launch: what a task needs.
+      fresh: give each task a process of its own, which ends with it.
 
     Raises:
       UserError: a task raised it, or its process died each time, and the others are given up; or there is no Ray or no
@@ -76,6 +77,7 @@ def run(
     with _connected() as ray:
         _warn_of_too_little(ray, launch)
         needs = {"num_cpus": launch.num_cpus, "num_gpus": launch.num_gpus}
+        needs |= {"max_calls": 1} if fresh else {}
         remote = ray.remote(max_retries=RETRIES, retry_exceptions=False, **needs)(_attempt)
         waiting, going = list(enumerate(tasks))[::-1], dict[Any, int]()
         try:

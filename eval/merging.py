@@ -22,7 +22,7 @@ def merge(parts: tyro.conf.Positional[tuple[pathlib.Path, ...]], out: pathlib.Pa
       dipn-eval merge results/part-0 results/part-1 results/part-2 --out results/hard
 
     Args:
-      parts: folders that dipn-eval clear, prediction or grasp wrote with --shard and --of: all of one evaluation.
+      parts: folders that dipn-eval clear, sweep, prediction or grasp wrote as parts: all of one evaluation.
       out: folder for the whole evaluation.
     """
     console.require_out(out)
@@ -69,7 +69,11 @@ def _merger(kind: str) -> Callable[[Sequence[Part], pathlib.Path], dict[str, Any
         from .prediction import merging as prediction
 
         return prediction.merge
-    raise UserError(f"{kind}: parts of no command that is known here; want clear, grasp or prediction")
+    if kind == "sweep":
+        from .clearing import sweep_merging as sweeping
+
+        return sweeping.merge
+    raise UserError(f"{kind}: parts of no command that is known here; want clear, sweep, grasp or prediction")
 
 
 def check(parts: Sequence[Part]) -> None:

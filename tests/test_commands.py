@@ -212,7 +212,7 @@ def test_commands_without_threads_are_those_that_simulate_nothing() -> None:
     without = {stage: {name for name, one in known.items() if not takes(one)} for stage, known in COMMANDS.items()}
     assert without == {
         "datagen": {"verify", "repair", "info", "export", "merge"},
-        "train": {"push", "grasp-pretrain", "grasp", "export"},
+        "train": {"push", "grasp-pretrain", "grasp", "sweep", "export"},
         "eval": {"merge", "report"},
     }
 

@@ -72,7 +72,8 @@ def parsed(words: list[str]) -> bool:
     known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
     with contextlib.suppress(SystemExit):
         console.run(program, {name: stub(name, command) for name, command in known.items()}, arguments)
-    return called == arguments[:1]
+    training = arguments[arguments.index("--") + 1 :] if "--" in arguments else []  # of dipn-train sweep
+    return called == arguments[:1] and (not training or parsed([program, *training, "--out", "one"]))
 
 
 @each_page

@@ -1,4 +1,4 @@
-"""The program `dipn-train`: push, grasp-pretrain, grasp, grasp-online, baseline, export."""
+"""The program `dipn-train`: push, grasp-pretrain, grasp, grasp-online, baseline, sweep, export."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from dipn_jax.addresses import Place
 
 from .acting_commands import baseline, grasp_online, say
 from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig
+from .sweep_command import sweep
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -36,7 +37,11 @@ def _fit(
 ) -> None:
     from .loop import fit
 
-    say(out, fit(task, config, out, initial=initial, compute=compute), digits=".4g")
+    result = fit(task, config, out, initial=initial, compute=compute)
+    if compute.check_only:
+        console.say(f"{out}: nothing is wrong with options and data")
+    else:
+        say(out, result, digits=".4g")
 
 
 def _join(compute: Compute) -> None:
@@ -160,6 +165,7 @@ def grasp(
     out: pathlib.Path,
     init: pathlib.Path | None = None,
     preset: Preset = "compact",
+    limit: int | None = None,
     config: TrainConfig = GRASP,
     compute: Compute = DEFAULT_COMPUTE,
 ) -> None:
@@ -173,6 +179,7 @@ def grasp(
       out: run folder; the same command continues where it stopped.
       init: run to start from (grasp-pretrain's), or builtin; its architecture is used.
       preset: architecture, without --init.
+      limit: learn from this many of the first grasps only; what is held out stays the same.
       config: optimizer and schedule; an example is a grasp.
       compute: how steps are computed.
     """
@@ -183,7 +190,10 @@ def grasp(
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    with _room(out, compute) as room, contextlib.closing(GraspTask(_local(data), network, room=room)) as task:
+    with (
+        _room(out, compute) as room,
+        contextlib.closing(GraspTask(_local(data), network, limit=limit, room=room)) as task,
+    ):
         _fit(task, config, out, compute, initial=initial)
 
 
@@ -223,6 +233,7 @@ COMMANDS = {
     "grasp": grasp,
     "grasp-online": grasp_online,
     "baseline": baseline,
+    "sweep": sweep,
     "export": export,
 }
 """The commands of `dipn-train`, by name."""

@@ -59,6 +59,8 @@ class Compute:
     is first used and kept in files under OUT/examples; these may be deleted afterwards."""
     compile_only: bool = False
     """Compile a step, say what memory it needs, and write nothing but the compiled program that JAX keeps."""
+    check_only: bool = False
+    """Check options, data and OUT, and write nothing."""
     profile: pathlib.Path | None = None
     """Folder for a profile of ten steps, for TensorBoard or Perfetto."""
     coordinator: str = ""

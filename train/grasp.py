@@ -20,7 +20,7 @@ from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
 from .example_store import IN_MEMORY, Kept, Room
-from .split import Folders, load_sides
+from .split import Folders, first, load_sides, within
 
 PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
@@ -188,21 +188,25 @@ class GraspTask:
 
     network = "grasp"
 
-    def __init__(self, data: Folders, config: grasp.GraspConfig, *, room: Room = IN_MEMORY) -> None:
+    def __init__(
+        self, data: Folders, config: grasp.GraspConfig, *, limit: int | None = None, room: Room = IN_MEMORY
+    ) -> None:
         """Load data sets.
 
         Args:
           data: folders of grasp episodes; the last tenth of each is held out.
           config: architecture.
+          limit: learn from this number of episodes only, the first ones; the same ones are held out.
           room: where the windows of a `compact` network are kept.
 
         Raises:
-          UserError: no folder; or one is damaged, or holds something else.
+          UserError: no folder; one is damaged, or holds something else; or they have fewer episodes.
         """
         sides = load_sides(data, kind="grasp")
-        self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
+        self.train_set, self.test_set = first(sides.learnt, limit, what="grasps"), sides.held_out
+        self.fingerprint = sides.fingerprint if limit is None else f"{sides.fingerprint}:{limit}"
         self.size = self.examples = len(self.train_set.fault)
-        self.parts = sides.parts
+        self.parts = within(sides.parts, self.size)
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
         self._kept = self._keeper(self.train_set, room)

@@ -125,7 +125,8 @@ def fit(
       compute: how steps are computed. Several processes call this with the same arguments; one of them writes.
 
     Returns:
-      The last evaluation; with `compute.compile_only` the memory that a step needs, in MB.
+      The last evaluation; with `compute.compile_only` the memory that a step needs, in MB; with `compute.check_only`
+      nothing.
 
     Raises:
       UserError: the folder holds a run of another config or on other data, or another process has it; or a loss or
@@ -135,6 +136,9 @@ def fit(
     order.batches(task.parts, config)  # raises where the mix is wrong, before anything is made
     where = devices.placement(compute, batch=config.batch)
     optimizer = make_optimizer(config, examples=task.size)
+    if compute.check_only:
+        _claim(out, _identity(task, config, compute, initial), config, write=False)
+        return {}
     if compute.compile_only:
         return _compile(task, config, optimizer, initial, compute, where)
     with owner.owned(out) if where.leads else contextlib.nullcontext():
@@ -265,17 +269,17 @@ def _identity(task: Task, config: TrainConfig, compute: Compute, initial: nnx.Mo
     return {**data, **network, **how, **unusual}
 
 
-def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig) -> None:
-    """Claim the folder; a rate that is constant allows more steps.
+def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig, *, write: bool = True) -> None:
+    """Claim the folder, or if not `write` only check that it can be; a rate that is constant allows more steps.
 
     Raises:
       UserError: the folder holds another run, or one whose rate has fallen for another number of steps.
     """
     if config.optimizer == "sgd":
-        return files.claim(out, identity, free=("steps",))
+        return files.claim(out, identity, free=("steps",), write=write)
     path = out / "config.json"
     begun = files.read_json(path).get("steps", config.steps) if path.exists() else config.steps
-    files.claim(out, identity | {"steps": begun})
+    files.claim(out, identity | {"steps": begun}, write=write)
     if begun != config.steps:
         raise UserError(
             f"{out}: its learning rate is planned for --steps {begun}, so that it cannot go on to {config.steps}; give "

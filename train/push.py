@@ -22,7 +22,7 @@ from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
 from .example_store import IN_MEMORY, Kept, Room
-from .split import Folders, load_sides
+from .split import Folders, first, load_sides, within
 
 
 @flax.struct.dataclass
@@ -68,15 +68,11 @@ class PushTask:
             return _chosen(episodes, folder, centimetres, without)
 
         sides = load_sides(data, kind="push", choose=choose)
-        learnt, self.test_set = sides.learnt, sides.held_out
-        count = len(learnt.fault)
-        if limit is not None and not 1 <= limit <= count:
-            raise UserError(f"--limit {limit}: want 1 to {count}, the pushes of --data that are not held out")
-        count = count if limit is None else limit
-        self.train_set = structs.take(learnt, slice(0, count))
+        self.train_set, self.test_set = first(sides.learnt, limit, what="pushes"), sides.held_out
+        count = len(self.train_set.fault)
         self.network_config = config
         self.size = self.examples = count
-        self.parts = _within(sides.parts, count)
+        self.parts = within(sides.parts, count)
         masks = ("found",) if found else ()
         self.fingerprint = ":".join(map(str, (sides.fingerprint, count, centimetres, *without, *masks)))
         self.centimetres = np.array(centimetres, np.int32)
@@ -168,12 +164,6 @@ class PushTask:
             total["held_out_loss"].append((self._share * float(loss), int(weight.sum())))
             total["moved_error_mm"].append((float(error), float(moved)))
         return {name: sum(v * w for v, w in rows) / max(sum(w for _, w in rows), 1e-9) for name, rows in total.items()}
-
-
-def _within(parts: tuple[int, ...], count: int) -> tuple[int, ...]:
-    """Return how many of the first `count` examples are of each data set, if `parts` are all of each."""
-    begins = np.cumsum([0, *parts[:-1]])
-    return tuple(int(np.clip(count - begin, 0, part)) for begin, part in zip(begins, parts, strict=True))
 
 
 def _chosen(

@@ -60,6 +60,24 @@ def load_sides(
     return Sides(learnt, held, parts, ":".join(fingerprint for _, fingerprint in loaded))
 
 
+def first(learnt: Any, limit: int | None, *, what: str) -> Any:
+    """Return the first `limit` of the episodes `learnt [B]`, or all where there is no limit.
+
+    Raises:
+      UserError: there are fewer; `what` says of what.
+    """
+    count = len(learnt.fault)
+    if limit is not None and not 1 <= limit <= count:
+        raise UserError(f"--limit {limit}: want 1 to {count}, the {what} of --data that are not held out")
+    return structs.take(learnt, slice(0, limit))
+
+
+def within(parts: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """Return how many of the first `count` episodes are of each data set, if `parts` are all of each."""
+    begins = np.cumsum([0, *parts[:-1]])
+    return tuple(int(np.clip(count - begin, 0, part)) for begin, part in zip(begins, parts, strict=True))
+
+
 def widened(episodes: Any, slots: int) -> Any:
     """Return episodes `[B, N]` as `[B, slots]`, so that data sets of different numbers of objects can be joined."""
     more = slots - episodes.scene.shape.shape[1]

@@ -75,6 +75,7 @@ def clear(
     longest: float,
     remember: bool,
     share: Share = WHOLE,
+    kind: str = "clear",
     command: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Clear tables and write the results, or the part of this worker; continues where it was interrupted.
@@ -89,7 +90,8 @@ def clear(
       longest: metres of the longest push.
       remember: whether the scores of grasps like one that missed are halved as long as the table looks the same.
       share: which tables this worker clears; every worker drops all of them, which takes little time.
-      command: that makes the evaluation, without `--out`, `--shard` and `--of`.
+      kind: command of dipn-eval that this belongs to.
+      command: its options that make the evaluation, without `--out`, `--shard` and `--of`.
 
     Returns:
       The metrics; none of a part.
@@ -104,7 +106,7 @@ def clear(
     seed = given["seed"]
     partial: resume.Partial = resume.Partial(out, given, inputs=inputs(runs, tables), part=share.named())
     with owner.owned(out):
-        if shares.made(out, "clear", share, partial):
+        if shares.made(out, kind, share, partial):
             return {}
         instances = tables.make(physics, seed=seed)
         rows = share.rows(len(instances))
@@ -114,7 +116,7 @@ def clear(
         if not share.whole:
             shares.write(
                 out,
-                "clear",
+                kind,
                 share,
                 total=len(instances),
                 command=command,

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from dipn_jax import console
+from dipn_jax import command_words, console
+from dipn_jax.errors import UserError
+from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName
 
-from .. import options
+from .. import options, shares
+from ..shares import WHOLE, Share
 from . import evaluation
 from .camera import DEFAULT_CAMERA, Camera
 from .tables import DEFAULT_TABLES, Tables
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from dipn_jax.engine import Engine
     from dipn_jax.planning.methods import Networks, PolicyConfig
     from dipn_jax.storage import resume
@@ -37,11 +44,16 @@ def sweep(
     seed: int = 1_000_000,
     engine: EngineName = "auto",
     threads: int | None = None,
+    share: Annotated[Share, tyro.conf.arg(name="")] = WHOLE,
+    launch: Annotated[Launch, tyro.conf.arg(name="")] = LOCAL,
 ) -> None:
     """Clear the same tables at one push distance after another, and with the policy that chooses the distance itself.
 
     Prediction error, completion and efficiency against distance:
       dipn-eval sweep --push-net builtin --grasp-net builtin --instances 10 --out results/sweep
+
+    A quarter of the tables at every distance, as one of four workers, for dipn-eval merge:
+      dipn-eval sweep --push-net builtin --grasp-net builtin --instances 10 --shard 0 --of 4 --out results/part-0
 
     Args:
       out: folder for metrics.json and sweep.png, and in a folder for each distance what dipn-eval clear writes.
@@ -58,34 +70,62 @@ def sweep(
       seed: random seed of scenes, perturbations and candidates.
       engine: physics engine.
       threads: that native simulates on; one a core if not given.
+      share: which part of the tables, and of the scenes of --pushes, this worker takes.
+      launch: where tables are cleared; as tasks, all shards are made and put together.
     """
-    given = evaluation.settings(locals()) | {"method": "dipn+gn", "label": ""}
+    asked = dict(locals())
+    given = evaluation.settings(asked) | {"method": "dipn+gn", "label": ""}
     from dipn_jax.physics import grouped, make_engine
     from dipn_jax.planning.methods import Networks, PolicyConfig
     from dipn_jax.storage import owner, resume
 
-    from .. import metrics
-    from . import sweeping
+    from .. import metrics, spread
+    from . import sweep_merging, sweeping
 
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
     chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold, aids=aids)
     evaluation.check(out, seed, chosen, tables)
+    share.check(launch)
+    if pushes and share.of > pushes:
+        raise UserError(f"--of {share.of}: more workers than --pushes {pushes}; want at most {pushes}, or --pushes 0")
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
     configs[sweeping.CHOSEN] = chosen
     networks, physics = Networks(push_net, grasp_net), grouped.apart(make_engine(engine, threads=threads))
-    kept = resume.Partial(out, given, inputs=evaluation.inputs(networks.runs("dipn+gn"), tables))
+    inputs = evaluation.inputs(networks.runs("dipn+gn"), tables)
+    kept = resume.Partial(out, given, inputs=inputs, part=share.named())
+    if launch.spreads:
+        spread.spread("sweep", asked, kept)
+        return
+    command = command_words.words(sweep, asked, without=shares.OWN)
     with owner.owned(out):
-        values = _clear_with_each(out, configs, networks, physics, tables, camera, given=given, kept=kept)
-        if pushes:
-            values |= _prediction_errors(push_net, physics, every, scenes=pushes, seed=seed)
-        sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
+        if shares.made(out, "sweep", share, kept):
+            return
+        clear = functools.partial(evaluation.clear, share=share, kind="sweep", command=command)
+        values = _clear_with_each(clear, out, configs, networks, physics, tables, camera, given=given, kept=kept)
+        errors = _errors(push_net, physics, every, scenes=pushes, seed=seed, share=share) if pushes else None
+        if not share.whole:
+            names = sweep_merging.save(out, list(configs), errors)
+            shares.write(
+                out,
+                "sweep",
+                share,
+                total=shares.read(out / sweeping.CHOSEN).total,
+                command=command,
+                given=given,
+                partial=kept,
+                names=names,
+                about={"names": list(configs), "errors": errors is not None},
+            )
+            return
+        values = sweep_merging.finish(out, values, errors, list(configs))
         metrics.write(out, values, settings=options.recorded(given, kept))
         kept.finish()
     console.say(f"{out / 'metrics.json'}: {len(values)} numbers")
 
 
 def _clear_with_each(
+    clear: Callable[..., dict[str, Any]],
     out: pathlib.Path,
     configs: dict[str, PolicyConfig],
     networks: Networks,
@@ -98,8 +138,19 @@ def _clear_with_each(
 ) -> dict[str, Any]:
     """Clear the same tables with each of `configs`, in a folder of its name; continues where it was interrupted.
 
+    Args:
+      clear: `evaluation.clear`, for the tables of this worker.
+      out: folder of the sweep.
+      configs: by name.
+      networks: that decide.
+      physics: physics engine.
+      tables: the tables to clear.
+      camera: what the policy sees.
+      given: options, for `settings.json`.
+      kept: where an interrupted sweep is kept.
+
     Returns:
-      All metrics, as `sweep/NAME/METRIC`.
+      All metrics, as `sweep/NAME/METRIC`; none of a part.
     """
     from . import on_tables
 
@@ -110,17 +161,17 @@ def _clear_with_each(
     policies = on_tables.load("dipn+gn", networks, physics, list(configs.values()), camera=camera)
     for name, decide in zip(configs, policies, strict=True):
         if name not in ended:
-            named = given | {"label": name}
-            ended[name] = evaluation.clear(
+            named = given | {"label": name, "out": out / name}
+            ended[name] = clear(
                 out / name, decide, physics, tables, given=named, runs=runs, longest=longest, remember=remember
             )
             kept.save(ended)
     return {f"sweep/{name}/{key}": value for name, found in ended.items() for key, value in found.items()}
 
 
-def _prediction_errors(
-    push_net: pathlib.Path, physics: Engine, distances: tuple[float, ...], *, scenes: int, seed: int
-) -> dict[str, float]:
+def _errors(
+    push_net: pathlib.Path, physics: Engine, distances: tuple[float, ...], *, scenes: int, seed: int, share: Share
+) -> dict[str, np.ndarray]:
     """Measure the errors of predicted masks at each of `distances`: one push on each of `scenes` as published."""
     from dipn_jax.planning.predictors import load_predictor
     from dipn_jax.world.scenes import PAPER
@@ -128,6 +179,6 @@ def _prediction_errors(
     from . import sweeping
 
     predictor = load_predictor(push_net)
-    return sweeping.prediction_errors(
-        predictor, physics, PAPER, distances, scenes=scenes, seed=seed, longest=max(distances)
+    return sweeping.measured(
+        predictor, physics, PAPER, distances, scenes=scenes, seed=seed, longest=max(distances), share=share
     )

@@ -25,6 +25,7 @@ from dipn_jax.world import clutter, primitives
 from dipn_jax.world.scenes import SceneConfig
 
 from .. import drawing, metrics
+from ..shares import WHOLE, Share
 
 CHOSEN = "chosen"
 """Name of the policy that chooses the distance of each push."""
@@ -66,40 +67,78 @@ def prediction_errors(
 ) -> dict[str, float]:
     """Measure true 1-IoU of predicted masks after one push per scene, the same pushes at every distance.
 
+    Args: as of `measured`.
+
+    Returns:
+      What `error_rates` makes of them.
+    """
+    found = measured(predictor, engine, config, distances, scenes=scenes, seed=seed, longest=longest)
+    return error_rates(found, [name(distance) for distance in distances])
+
+
+def measured(
+    predictor: Predictor,
+    engine: Engine,
+    config: SceneConfig,
+    distances: Sequence[float],
+    *,
+    scenes: int,
+    seed: int,
+    longest: float,
+    share: Share = WHOLE,
+) -> dict[str, np.ndarray]:
+    """Measure 1-IoU of predicted masks after one push on each scene of this worker, the same pushes at every distance.
+
     Args:
       predictor: of `config.slots` objects.
       engine: the engine whose result counts as the truth, at rest and without the gripper.
       config: scenes.
-      distances: metres.
-      scenes: number of scenes.
+      distances: `K` of them, metres.
+      scenes: number of scenes of all workers.
       seed: random seed of scenes and pushes.
       longest: metres that are simulated, the same for all distances.
+      share: which scenes this worker pushes on; every worker drops all of them.
 
     Returns:
-      `sweep/DISTANCE/push_error/{all,moved}` with bootstrap 95 % intervals over scenes.
+      Of the scenes on which a push is feasible, `scene [B]`, their numbers, `error [B, K, 2]`, the sum of 1-IoU over
+      objects in sight, and over those of them that move, and `count [B, K, 2]`, the numbers of these objects.
     """
     key, aim = jax.random.split(seeds.key(seed, seeds.Purpose.SWEEP_SCENES))
     items = clutter.settled_scenes(key, engine, config, scenes)
-    keys = jax.random.split(aim, scenes)
+    mine = np.array(share.rows(scenes))
+    items, keys = structs.take(items, mine), jax.random.split(aim, scenes)[mine]
     seen, pushes, feasible = batching.in_batches(_look, keys, items.scene, items.poses)
     rows = np.flatnonzero(feasible)
     seen, pushes = structs.take(seen, rows), structs.take(pushes, rows)
     scene, poses = structs.take(items.scene, rows), items.poses[rows]
-    values: dict[str, float] = {}
+    error, count = np.zeros((len(rows), len(distances), 2), np.float32), np.zeros((len(rows), len(distances), 2), int)
     with console.Progress("predict", len(distances) * len(rows), unit="pushes") as progress:
-        for distance in distances:
+        for at, distance in enumerate(distances if len(rows) else ()):
             each = pushes.replace(distance=np.full(len(rows), distance, np.float32))
             rollout = primitives.push(engine, scene, poses, each, longest=longest)
             after = np.asarray(rollout.poses)[:, -1]
             measure = functools.partial(_errors, predictor=predictor)
-            error, visible, moved = batching.in_batches(measure, seen, each, scene, poses, after)
+            wrong, visible, moved = map(np.asarray, batching.in_batches(measure, seen, each, scene, poses, after))
             good = Fault.usable(rollout.fault)[:, None]
-            for which, mask in (("all", visible), ("moved", moved)):
-                counted = np.asarray(mask) & good
-                found = metrics.ratio_interval((np.asarray(error) * counted).sum(1), counted.sum(1))
-                at = f"sweep/{name(distance)}/push_error/{which}"
-                values |= dict(zip((at, f"{at}_low", f"{at}_high"), found, strict=True))
+            for which, mask in enumerate((visible, moved)):
+                error[:, at, which], count[:, at, which] = (wrong * (mask & good)).sum(1), (mask & good).sum(1)
             progress.advance(len(rows), f"{100 * distance:.0f} cm")
+    return {"scene": mine[rows], "error": error, "count": count}
+
+
+def error_rates(found: dict[str, np.ndarray], distances: Sequence[str]) -> dict[str, float]:
+    """Return `sweep/DISTANCE/push_error/{all,moved}` with bootstrap 95 % intervals over scenes.
+
+    Args:
+      found: as `measured` returns it, of all workers.
+      distances: the names of the distances.
+    """
+    values: dict[str, float] = {}
+    for number, distance in enumerate(distances):
+        for kind, which in enumerate(("all", "moved")):
+            hits = metrics.ratio_interval(found["error"][:, number, kind], found["count"][:, number, kind])
+            at = f"sweep/{distance}/push_error/{which}"
+            values |= dict(zip((at, f"{at}_low", f"{at}_high"), hits, strict=True))
     return values
 
 

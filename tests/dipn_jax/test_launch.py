@@ -70,6 +70,8 @@ def test_every_task_is_done_once_and_few_are_submitted_at_a_time(ray: _Ray) -> N
     assert found == {number: 2 * (20 + number) for number in range(20)}
     assert ray.most_going == 4 and ray.cancelled == []
     assert ray.options == {"num_cpus": 1.0, "num_gpus": 0.0, "max_retries": launch.RETRIES, "retry_exceptions": False}
+    list(launch.run(_double, [], launch=Launch("ray"), fresh=True))
+    assert ray.options["max_calls"] == 1
 
 
 @pytest.mark.parametrize(("number", "says"), [(5, "five: want another number"), (6, "/data: No space left on device")])

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from dipn_jax.eval import cli, merging, shares
+from dipn_jax.eval.clearing import lockstep
 from dipn_jax.eval.prediction import push_errors
 from dipn_jax.eval.shares import Share
 
@@ -21,6 +22,8 @@ WORDS = {
     "clear": ("--method", "gn", "--grasp-net", "grasp", "--cases", "random", "--objects", "1:2", "--instances", "3",
               "--aids", "memory"),
     "grasp": ("--grasp-net", "grasp", "--scenes", "3", "--objects", "1", "--others", "1", "--aids"),
+    "sweep": ("--push-net", "dipn", "--grasp-net", "grasp", "--cases", "random", "--objects", "1", "--instances", "3",
+              "--distances", "0.05:0.05:0.01", "--candidates", "2", "--pushes", "3", "--aids"),
     "prediction": ("--push-net", "dipn", "--scenes", "5", "--objects", "1:2", "--no-physics"),
 }  # fmt: skip
 """Small evaluations, and the networks that they need."""
@@ -65,7 +68,7 @@ def test_parts_make_the_very_evaluation_of_one_worker(
     (whole,), merged = evaluated(kind, None), tmp_path / "merged"
     names = sorted(str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file())
     assert names == sorted(str(path.relative_to(merged)) for path in merged.rglob("*") if path.is_file())
-    assert "metrics.json" in names and (kind == "prediction" or "episodes/002.npz" in names)
+    assert "metrics.json" in names and (kind == "prediction" or any("episodes/002.npz" in name for name in names))
     for name in names:
         if not name.endswith(("settings.json", ".png")):
             assert (merged / name).read_bytes() == (whole / name).read_bytes(), name
@@ -84,6 +87,32 @@ def test_a_part_that_is_there_is_not_made_again_and_another_is_refused(
     assert _run(*words, "--shard", 1, "--of", OF) == 2
     assert "holds another part of an evaluation; give another --out" in capfd.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in part.rglob("*")} == before
+
+
+@pytest.mark.slow
+def test_a_part_of_a_sweep_has_a_part_for_each_distance(
+    evaluated: Callable[[str], pathlib.Path],
+    tiny: dict[str, pathlib.Path],
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """These are not made again where the whole part was not ended, and cannot be merged alone."""
+    first, second = evaluated("sweep")
+    assert _run("merge", first / "0.05", second / "0.05", "--out", tmp_path / "out") == 2
+    assert "of one distance only (names is missing); give the folder of the whole part" in capfd.readouterr().err
+    begun = pathlib.Path(shutil.copytree(first, tmp_path / "begun"))
+    (begun / shares.PART).unlink()
+    monkeypatch.setattr(lockstep, "clear", None)
+    words = ["sweep", *(str(tiny.get(word, word)) for word in WORDS["sweep"]), "--engine", "native", "--out", begun]
+    assert _run(*words, "--shard", 0, "--of", OF) == 0
+    assert (begun / shares.PART).read_text() == (first / shares.PART).read_text().replace(str(first), str(begun))
+    film = next((begun / "chosen" / "episodes").iterdir())
+    film.write_bytes(b"")
+    assert _run("merge", begun, second, "--out", tmp_path / "out") == 2
+    assert f"{film}: missing, or damaged since it was written" in capfd.readouterr().err
+    assert _run(*words[:-1], tmp_path / "out", "--shard", 0, "--of", 4) == 2
+    assert "--of 4: more workers than --pushes 3; want at most 3, or --pushes 0" in capfd.readouterr().err
 
 
 def _edited(part: pathlib.Path, out: pathlib.Path, change: dict[str, Any]) -> pathlib.Path:
@@ -158,7 +187,7 @@ def _asked(words: list[str]) -> dict[str, Any]:
     return found[0]
 
 
-@pytest.mark.parametrize("kind", WORDS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind == "sweep")) for kind in WORDS])
 def test_a_missing_part_is_named_with_the_command_that_makes_it(
     kind: str,
     evaluated: Callable[..., list[pathlib.Path]],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dipn_jax.train import cli, loop
 from dipn_jax.train.configs import DEFAULT_COMPUTE, TrainConfig
-from dipn_jax.train.grasp import PretrainTask
+from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.push import PushTask
 from dipn_jax.train.split import load_sides, widened
 
@@ -43,6 +43,16 @@ def test_pushes_of_several_data_sets_are_learnt_from(data: Data, wider: Data) ->
     assert task.fingerprint.startswith(alone.fingerprint.split(":")[0]) and task.fingerprint != alone.fingerprint
     fewer = PushTask((data["push"], wider["push"]), DipnConfig(), limit=3, centimetres=(5,))
     np.testing.assert_array_equal(fewer.train_set.poses, task.train_set.poses[:3])
+
+
+def test_the_first_grasps_only_are_learnt_from(data: Data) -> None:
+    task = GraspTask(data["grasp"], GraspConfig())
+    fewer = GraspTask(data["grasp"], GraspConfig(), limit=3)
+    assert fewer.size == 3 and fewer.fingerprint == f"{task.fingerprint}:3"
+    np.testing.assert_array_equal(fewer.train_set.poses, task.train_set.poses[:3])
+    np.testing.assert_array_equal(fewer.test_set.poses, task.test_set.poses)
+    with pytest.raises(UserError, match="--limit 21: want 1 to 20, the grasps of --data that are not held out"):
+        GraspTask(data["grasp"], GraspConfig(), limit=21)
 
 
 def test_the_last_tenth_of_each_is_held_out(data: Data, wider: Data) -> None:

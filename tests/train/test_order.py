@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dipn_jax.train import order
 from dipn_jax.train.configs import TrainConfig
-from dipn_jax.train.push import _within
+from dipn_jax.train.split import within
 
 from dipn_jax.errors import UserError
 
@@ -37,7 +37,7 @@ def test_a_mix_takes_its_share_from_each_data_set_and_all_of_both() -> None:
 
 
 def test_the_first_examples_are_of_the_first_data_sets() -> None:
-    assert [_within((10, 6, 4), count) for count in (20, 17, 3)] == [(10, 6, 4), (10, 6, 1), (3, 0, 0)]
+    assert [within((10, 6, 4), count) for count in (20, 17, 3)] == [(10, 6, 4), (10, 6, 1), (3, 0, 0)]
 
 
 @pytest.mark.parametrize(

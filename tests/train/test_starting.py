@@ -8,6 +8,7 @@ from dipn_jax.train import cli, online
 from dipn_jax.train.loop import TrainConfig
 from flax import nnx
 
+from dipn_jax import console, files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import checkpoint
@@ -27,6 +28,22 @@ def test_the_refusal_of_more_steps_says_how_and_a_run_starts_from_another(
         np.testing.assert_allclose(a, b, atol=1e-6)  # the rate of the first step is 0
     with pytest.raises(UserError, match=f"is planned for --steps 1, .* --init {tmp_path / 'a'} and another --out"):
         cli.push(data["push"], tmp_path / "a", init=pathlib.Path("builtin"), config=TrainConfig(steps=2, batch=2))
+
+
+def test_options_data_and_folder_can_be_checked_without_writing(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    push = ["push", "--data", str(data["push"]), "--out", str(out), "--check-only"]
+    assert console.run("test", cli.COMMANDS, push) == 0
+    assert capfd.readouterr().out == f"{out}: nothing is wrong with options and data\n" and not out.exists()
+    assert console.run("test", cli.COMMANDS, [*push, "--limit", "99"]) == 2
+    assert "--limit 99: want 1 to 20" in capfd.readouterr().err and not out.exists()
+    files.write_json(out / "config.json", {"network": "grasp"})
+    for optimizer in ("adamw", "sgd"):
+        assert console.run("test", cli.COMMANDS, [*push, "--optimizer", optimizer]) == 2
+        assert f"{out}: begun with network=grasp, asked for network=dipn" in capfd.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["config.json"]
 
 
 @pytest.mark.slow

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import pathlib
+import types
 from typing import Any
 
 import numpy as np
 import pytest
-from dipn_jax.eval.clearing import sweeping
+from dipn_jax.eval.clearing import sweep_merging, sweeping
+from dipn_jax.eval.shares import WHOLE, Share
 
 from dipn_jax import structs
 from dipn_jax.planning import predictors
@@ -19,6 +22,8 @@ SIZES = (0.05, 0.02, 0.04, 0.04, 0.04)
 PLACES = ((-0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.1, 0.0), (0.1, 0.1))
 SHIFT = 0.02
 """Metres along x by which objects are moved: ten pixels."""
+DISTANCES = (0.05, 0.1)
+"""Metres of the pushes."""
 MOVED_ERROR = 1 - (20 - 10) / (20 + 10)
 """1 - IoU of a cube of 20 x 20 pixels that is predicted to stay and was moved by ten."""
 
@@ -73,20 +78,25 @@ class Shifts:
         return Rollout(out, np.zeros((*out.shape[:2], 5), np.float32), fault)
 
 
-def _sweep(fault: int, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+def _measured(fault: int, monkeypatch: pytest.MonkeyPatch, share: Share = WHOLE) -> dict[str, np.ndarray]:
     scene, poses = structs.take(_cubes(), np.array([0, 1, 0]))
     friction = np.repeat(np.array([0.5, 1, 0.5], np.float32)[:, None], 5, 1)
     items = SettledScene(scene.replace(friction=friction), poses, np.zeros(3, np.int32))
     monkeypatch.setattr(clutter, "settled_scenes", lambda *_: items)
-    return sweeping.prediction_errors(
+    return sweeping.measured(
         predictors.static_predictor,
         Shifts(fault),  # type: ignore[arg-type]
         scenes.fixed_count(5),
-        (0.05, 0.1),
+        DISTANCES,
         scenes=3,
         seed=0,
         longest=0.1,
+        share=share,
     )
+
+
+def _sweep(fault: int, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    return sweeping.error_rates(_measured(fault, monkeypatch), [sweeping.name(each) for each in DISTANCES])
 
 
 def test_a_simulation_that_went_wrong_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,3 +105,21 @@ def test_a_simulation_that_went_wrong_does_not_count(monkeypatch: pytest.MonkeyP
         assert without[f"{at}/moved"] == pytest.approx(MOVED_ERROR)
         assert without[f"{at}/all"] == pytest.approx(MOVED_ERROR / 3)
         assert every[f"{at}/all"] == pytest.approx(MOVED_ERROR * 4 / 9)
+
+
+def test_workers_that_share_the_scenes_measure_what_one_does(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where no push is feasible on any scene of one of them."""
+    look = sweeping._look
+    monkeypatch.setattr(sweeping, "_look", lambda *given: (*look(*given)[:2], given[1].friction[:, 0] == 0.5))
+    whole = _measured(Fault.SPEED, monkeypatch)
+    assert whole["scene"].tolist() == [0, 2]
+    parts = []
+    for shard in range(3):
+        found = _measured(Fault.SPEED, monkeypatch, Share(shard, 3))
+        sweep_merging.save(tmp_path / str(shard), [], found)
+        parts.append(types.SimpleNamespace(folder=tmp_path / str(shard), path=(tmp_path / str(shard)).joinpath))
+    pooled = sweep_merging._pooled(parts[::-1], len(DISTANCES))  # type: ignore[arg-type]
+    for name, values in whole.items():
+        np.testing.assert_array_equal(pooled[name], values)
