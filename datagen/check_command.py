@@ -30,7 +30,7 @@ def check_world(
       few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
       tries: grasps of every catalogue item.
       seed: random seed of everything.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
     """
     from . import check
 

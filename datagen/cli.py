@@ -40,7 +40,7 @@ class Work:
     of: int = 1
     """Number of workers; each makes every of-th shard of the same data set."""
     threads: int | None = None
-    """Threads that native simulates on, one a core if not given; shards are then made one at a time."""
+    """Threads of the native engine, one per core by default; if given, shards are made one at a time."""
 
     launch: Launch = LOCAL
     """Where the shards are made."""

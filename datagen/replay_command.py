@@ -42,7 +42,7 @@ def replay(
       tolerance: largest difference that counts as none, in metres and components of quaternions; 1e-6 if not given,
         to which both are stored.
       seed: of --sample.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
     """
     if bool(ids) + all_ + (sample is not None) != 1:
         raise UserError("replay: give numbers of episodes, or --all, or --sample with how many")

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dipn_jax.errors import UserError
     from dipn_jax.physics import make_engine
-    from dipn_jax.planning.methods import load_policy
-    from dipn_jax.planning.planner import Rule, decide
+    from dipn_jax.planning.methods import PolicyConfig, load_policy
+    from dipn_jax.planning.planner import decide
     from dipn_jax.sight.imagine import imagine
     from dipn_jax.sight.observed import check_observation
     from dipn_jax.sight.render import render
@@ -37,8 +37,8 @@ __all__ = [
     "Decision",
     "Grasp",
     "Observation",
+    "PolicyConfig",
     "Push",
-    "Rule",
     "Scene",
     "SceneConfig",
     "UserError",
@@ -58,8 +58,8 @@ _MODULES = {
     "errors": ("UserError",),
     "structs": ("Decision", "Grasp", "Observation", "Push", "Scene"),
     "physics": ("make_engine",),
-    "planning.methods": ("load_policy",),
-    "planning.planner": ("Rule", "decide"),
+    "planning.methods": ("PolicyConfig", "load_policy"),
+    "planning.planner": ("decide",),
     "sight.imagine": ("imagine",),
     "sight.observed": ("check_observation",),
     "sight.render": ("render",),

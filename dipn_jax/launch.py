@@ -51,7 +51,7 @@ class Launch:
         return self.launcher != "local"
 
     def threads(self, given: int | None) -> int | None:
-        """Return the threads that native simulates on: those that are given, or for a task one a core of its own."""
+        """Return the threads of the native engine: those given, or in a task one per core that it has reserved."""
         return max(1, int(self.num_cpus)) if self.spreads and given is None else given
 
 

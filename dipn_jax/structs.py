@@ -218,6 +218,10 @@ class Candidates(Pytree):
 class Decision(Pytree):
     """The action chosen on one table, and what it was compared with.
 
+    `value_now` and `value_push` have the method's unit. Alg. 2 (dipn+gn, rea+dipn, physics+gn): the mean score of all
+    grasps, times gamma after a push. dipn+gn+actions: minus the expected number of actions besides one for each object.
+    vpg, dqn+gn: the value that a network predicts.
+
     Example:
       decision = policy(key, observation)             # a dipn_jax.Decision
       action = decision.push if decision.is_push else decision.grasp
@@ -228,11 +232,11 @@ class Decision(Pytree):
     grasp: Grasp  # the best one
     grasp_pixel: Int[Array, "*b 3"]  # rotation, row, col of it
     grasp_score: Float[Array, "*b"]  # score of it in [0, 1], or its value
-    value_now: Float[Array, "*b"]  # mean score of all grasps now (of the cautious ones if no push was allowed)
-    value_push: Float[Array, "*b"]  # gamma times the mean score after the best push; -inf if none is feasible
+    value_now: Float[Array, "*b"]  # what the grasp is worth: mean score; or minus expected actions; or its value
+    value_push: Float[Array, "*b"]  # what the best push is worth, in the same unit; -inf if none is feasible
     motion: Float[Array, "*b N 3"]  # predicted dx, dy (metres), dtheta (radians) for the best push
     best: Int[Array, "*b"] | None = None  # index of the best push among the candidates
-    values: Float[Array, "*b P"] | None = None  # gamma times the mean score after each candidate; -inf: not feasible
+    values: Float[Array, "*b P"] | None = None  # gamma times mean score, or value, of each; -inf: not feasible
     candidates: Candidates | None = None
     predicted: Float[Array, "*b H W 4"] | None = None  # predicted RGB and height after the best push
 

@@ -66,6 +66,10 @@ def make_part(kind: str, given: dict[str, Any]) -> None:
     """Make a part by the command that makes it alone; a task, which may have been tried before, or run twice.
 
     It works in a folder of its own, which gets the part's name at the end, unless another did that meanwhile.
+
+    Args:
+      kind: command of dipn-eval.
+      given: its options by name, as its function takes them; a dictionary, because each command has its own.
     """
     from . import cli
 

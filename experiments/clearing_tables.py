@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import lockstep, sweeping
 from dipn_jax.eval.report import paper
 
-from dipn_jax.names import ALL_AIDS
+from dipn_jax.names import ALL_AIDS, MethodName
 from experiments import runs
 from experiments.kept import Kept
 from experiments.runs import Run
@@ -44,6 +44,7 @@ def numbers(listed: Sequence[Run], kept: Kept) -> dict[str, Any]:
         tables = kept.tables(run, key)
         if tables is not None:
             groups.setdefault(_group(run.name), {})[run.name.rpartition("/")[2]] = tables
+    groups |= _hindsight(groups)
     values: dict[str, Any] = {}
     for name, trainings in groups.items():
         values |= {f"{name}/{key}": value for key, value in _measured(trainings).items()}
@@ -51,6 +52,22 @@ def numbers(listed: Sequence[Run], kept: Kept) -> dict[str, Any]:
         if ours and ours is not trainings:
             values |= {f"{name}/{key}": value for key, value in _compared(trainings, ours).items()}
     return values
+
+
+def _hindsight(groups: dict[str, Trainings]) -> dict[str, Trainings]:
+    """Return, for the hard kinds of tables, the better of the outcomes with and without pushes, chosen table by table.
+
+    The better one has removed more; of two that have removed as much, the one with fewer actions. So nobody can choose:
+    it says how much a rule that knows when to push could win at most, with these networks.
+    """
+    found: dict[str, Trainings] = {}
+    for on in ("heldout", "hard"):
+        both = [groups.get(f"table/{on}/shipped/all/{method}") for method in PUSH_OR_NOT]
+        if both[0] and both[1]:
+            pairs = zip(*(one["0"] for one in both if one), strict=True)
+            better = [max(pair, key=lambda one: (one.removed, -one.grasps - one.pushes)) for pair in pairs]
+            found[f"hindsight/{on}"] = {"0": better}
+    return found
 
 
 def _group(name: str) -> str:
@@ -62,7 +79,7 @@ def _rival(name: str) -> str:
     """Return the group that a group is compared with: DIPN+GN on the same tables, as it is shipped."""
     if name.startswith("table/"):
         return f"{name.rpartition('/')[0]}/{OURS}"
-    if name.startswith("masks/"):
+    if name.startswith(("masks/", "hindsight/")):
         return f"table/{name.split('/')[1]}/shipped/all/{OURS}"
     if name.startswith("changed/"):
         return f"{name.rpartition('/')[0]}/{OURS}"
@@ -135,8 +152,8 @@ def _table(values: dict[str, Any], head: str, rows: dict[str, str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-METHODS = ("dipn+gn", "dipn+gn+actions", "gn", "dqn+gn", "rea+dipn", "vpg", "physics+gn")
-"""Methods in the order of the tables."""
+PUSH_OR_NOT = ("gn", "dipn+gn+actions")
+"""Methods of which the better one is chosen in hindsight."""
 
 
 def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
@@ -147,10 +164,12 @@ def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
     rows = {
         f"table/{on}/{budget}/{aids}/{method}": f"{method}, {budget}"
         for budget in ("shipped", "large", "paper")
-        for method in METHODS
+        for method in get_args(MethodName)
     }
     if not any(f"{at}/tables" in values for at in rows):
         return ""
+    if aids == "all":
+        rows[f"hindsight/{on}"] = f"the better of {' and '.join(PUSH_OR_NOT)}, in hindsight"
     text = _table(values, f"{on}, {'all aids' if aids == 'all' else 'bare'}", rows)
     for method, published in paper.TABLE.get(on, {}).items() if aids == "bare" else ():
         found = dict(zip(paper.COLUMNS, published, strict=True))

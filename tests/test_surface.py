@@ -8,7 +8,7 @@ import pathlib
 import subprocess
 import sys
 import textwrap
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ import pytest
 from flax import nnx
 
 import dipn_jax
+from dipn_jax.names import MethodName
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.planning import methods, predictors
@@ -34,6 +35,11 @@ def test_every_public_name_exists_and_shows_its_use() -> None:
         home = importlib.import_module(dipn_jax._HOME[name])
         assert getattr(home, name) is item
         assert item.__doc__ and f"dipn_jax.{name}" in item.__doc__, f"{name}: its docstring shows no use"
+
+
+def test_every_method_that_commands_name_is_one_entry_of_the_registry() -> None:
+    assert tuple(methods.METHODS) == get_args(MethodName)
+    assert {name for name, method in methods.METHODS.items() if method.needs_state} == {"physics+gn"}
 
 
 def _snippet(text: str) -> str:
@@ -105,7 +111,7 @@ def test_a_policy_is_loaded_by_its_name(settled: Any) -> None:
     np.testing.assert_array_equal(grasping.grasp_pixel, both.grasp_pixel)
     _, row, col = grasping.grasp_pixel
     assert observation.label[row, col] >= 0, "it grasps an object"
-    with pytest.raises(dipn_jax.UserError, match="--method vpg: needs --value-net"):
+    with pytest.raises(dipn_jax.UserError, match=r"--method vpg: needs --value-net \(in Python value_net\)"):
         dipn_jax.load_policy("vpg")
     with pytest.raises(dipn_jax.UserError, match=r"physics.gn: decides on the simulator's state"):
         dipn_jax.load_policy("physics+gn")

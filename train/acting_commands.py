@@ -42,7 +42,7 @@ def grasp_online(
       init: run to start from (grasp-pretrain's), or builtin; without it the compact network has random weights.
       objects: number of objects on a fresh table.
       engine: physics engine.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
       ranges: the ranges that random objects are drawn from.
       config: amount and schedule of learning.
     """
@@ -90,7 +90,7 @@ def baseline(
       grasp_net: run of dipn-train grasp or grasp-online, or builtin, whose grasps dqn takes.
       objects: number of objects on a fresh table.
       engine: physics engine.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
       ranges: the ranges that random objects are drawn from.
       config: method, and amount and schedule of learning.
     """

@@ -93,14 +93,14 @@ def push(
     config: TrainConfig = PUSH,
     compute: Compute = DEFAULT_COMPUTE,
 ) -> None:
-    """Train DIPN on push episodes; one network for every push distance.
+    r"""Train DIPN on push episodes; one network for every push distance.
 
     About four minutes on two cores:
       dipn-train push --data data/push --out runs/dipn
 
     As published (a GPU's work; 50 epochs of 1,500 pushes; when the rate falls is our reading of the released code):
-      dipn-train push --data data/push --out runs/paper --preset paper --optimizer published --learning-rate 1e-3 \
-        --batch 8 --weight-decay 2e-4 --limit 1500 --steps 9375 --centimetres 5
+      dipn-train push --data data/push --out runs/paper --preset paper --optimizer published \
+        --learning-rate 1e-3 --batch 8 --weight-decay 2e-4 --limit 1500 --steps 9375 --centimetres 5
 
     Args:
       data: folders, or URLs, of push episodes; of each the last tenth is held out.

@@ -73,7 +73,12 @@ class Policy:
 
 @dataclasses.dataclass(frozen=True)
 class PolicyConfig:
-    """How a method decides, apart from its networks."""
+    """How a method decides, apart from its networks.
+
+    Example:
+      config = dipn_jax.PolicyConfig(gamma=0.8, aids=())       # no aids: bare
+      policy = dipn_jax.load_policy("dipn+gn", config=config)
+    """
 
     candidates: int = 32  # pushes considered at a time
     distances: tuple[float, ...] = (0.10,)  # metres a push goes; of several, candidates take them in turn
@@ -107,6 +112,11 @@ class Method:
     about: str
     pushes: bool = True  # whether it ever pushes
 
+    @property
+    def needs_state(self) -> bool:
+        """Whether it decides on the simulator's state, so that it is no policy of images."""
+        return self.build is None
+
 
 @dataclasses.dataclass(frozen=True)
 class Networks:
@@ -125,10 +135,8 @@ class Networks:
         needed = find(method).networks
         for role in needed:
             if getattr(self, role) is None:
-                builtin = "" if role == "value" else ", or builtin"
-                raise UserError(
-                    f"--method {method}: needs --{role}-net; give a run of dipn-train {ROLES[role][1]}{builtin}"
-                )
+                run = f"a run of dipn-train {ROLES[role][1]}{'' if role == 'value' else ', or builtin'}"
+                raise UserError(f"--method {method}: needs --{role}-net (in Python {role}_net); give {run}")
         return {role: checkpoint.find(getattr(self, role), network=ROLES[role][0]) for role in needed}
 
 
@@ -169,7 +177,7 @@ def load_policy(
         state (`physics+gn`).
     """
     paths = (None if run is None else pathlib.Path(run) for run in (push_net, grasp_net, value_net))
-    if find(method).build is None:
+    if find(method).needs_state:
         raise UserError(f"--method {method}: decides on the simulator's state, not on an image; run dipn-eval clear")
     return build(find(method), Networks(*paths).runs(method), config)
 
@@ -179,7 +187,7 @@ def build(method: Method, runs: Runs, config: PolicyConfig) -> Policy:
 
     Where all of them come with the package, policies with the same aids share what is compiled.
     """
-    assert method.build is not None
+    assert method.build is not None, "it needs the simulator's state"
     if not all(run.is_relative_to(checkpoint.SHIPPED) for run in runs.values()):
         return method.build(runs, config)
     shared = _of_shipped(method.build, tuple(runs.items()), config.released, config.aids)
@@ -272,11 +280,8 @@ def _part(run: pathlib.Path, name: str, aids: tuple[Aid, ...] = ()) -> Scorer:
     Raises:
       UserError: it was trained without.
     """
-    found = scorers.load_values(run, aids=aids)[vpg.PARTS.index(name)]
-    if found is None:
-        raise UserError(
-            f"--value-net {run}: was not trained to {name}; give a run of another dipn-train baseline --method"
-        )
+    if (found := scorers.load_values(run, aids=aids)[vpg.PARTS.index(name)]) is None:
+        raise UserError(f"--value-net {run}: was not trained to {name}; give a run of another --method")
     return found
 
 
@@ -285,10 +290,10 @@ METHODS: dict[str, Method] = {
     "dipn+gn+actions": Method(
         ("push", "grasp"), _dipn_gn_actions, "the same pushes, made where they save more than the action they cost"
     ),
-    "rea+dipn": Method(("push", "value"), _rea_dipn, "the same with REA's grasp network in place of GN"),
-    "dqn+gn": Method(("value", "grasp"), _dqn_gn, "GN for grasps, Q-learning for pushes"),
-    "vpg": Method(("value",), _vpg, "two Q-functions, one of pushes and one of grasps"),
     "gn": Method(("grasp",), _gn, "GN's best grasp, never a push", pushes=False),
-    "physics+gn": Method(("grasp",), None, "imagine every push with the engine itself: a privileged ceiling"),
+    "dqn+gn": Method(("value", "grasp"), _dqn_gn, "GN for grasps, Q-learning for pushes"),
+    "rea+dipn": Method(("push", "value"), _rea_dipn, "as dipn+gn, with REA's grasp network in place of GN"),
+    "vpg": Method(("value",), _vpg, "two Q-functions, one of pushes and one of grasps"),
+    "physics+gn": Method(("grasp",), None, "imagine every push with the engine itself, from the simulator's state"),
 }
 """All methods by name."""

@@ -45,7 +45,7 @@ class Rule(Pytree):
     """How Alg. 2 decides; every field is traced. The defaults are the paper's rule.
 
     Example:
-      decision = dipn_jax.decide(key, observation, predictor, scorer, rule=dipn_jax.Rule(gamma=0.8))
+      decision = dipn_jax.decide(key, observation, predictor, scorer, rule=Rule(gamma=0.8))
     """
 
     gamma: Float[Array, ""] | float = 0.9  # discount of a push's value
@@ -72,7 +72,9 @@ RELEASED = Rule(edge_factor=2.0, grasp_lone=True, push_must_raise_best=True, dis
 def summarize_whole(scorer: Scorer) -> ScoreSummary:
     """Return the summary that scores every wanted image whole."""
 
-    def summarize(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def summarize(
+        now: Float[jax.Array, "H W 4"], images: Float[jax.Array, "P H W 4"], wanted: Bool[jax.Array, " P"]
+    ) -> tuple[Float[jax.Array, " Q"], Float[jax.Array, " Q"]]:
         def one(args: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             image, want = args
             nothing = (jnp.zeros(()), jnp.zeros(()))
@@ -166,8 +168,8 @@ def _count_actions(
 ) -> Decision:
     """Return the decision between the same grasp and push by the actions that each costs.
 
-    A push is one action, and has to save more than one grasp that misses. The values are minus the expected numbers of
-    actions besides one for each object.
+    A push is one action, and has to save more than one grasp that misses. `value_now` and `value_push` become minus the
+    expected numbers of actions besides one for each object; `values` of the candidates stay mean scores.
     """
     centers, _ = masks.mask_centers(observation.label, observation.slots)
     now = estimate(observation, missed)

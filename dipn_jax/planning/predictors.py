@@ -67,7 +67,7 @@ def dipn_predictor(model: dipn.DIPN, *, mirrors: bool = True) -> Predictor:
     """Return DIPN as a predictor of each push's own distance; `mirrors` as of `dipn_motions`."""
     graph, state = nnx.split(model)
 
-    def predict(observation: Observation, pushes: Push) -> jax.Array:
+    def predict(observation: Observation, pushes: Push) -> Float[jax.Array, "P N 3"]:
         network = nnx.merge(graph, state)
         return dipn_motions(network, observation, pushes, pushes.distance[:, None], mirrors=mirrors)[:, 0]
 

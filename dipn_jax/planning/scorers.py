@@ -10,6 +10,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jaxtyping import Bool, Float
 
 from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.networks import grasp, local, vpg
@@ -30,7 +31,7 @@ def _scorer(model: nnx.Module, score: Callable[[Any, jax.Array], jax.Array]) -> 
     """Return a scorer that applies `score` to one image after another."""
     thaw = _frozen(model)
 
-    def scores(images: jax.Array) -> jax.Array:
+    def scores(images: Float[jax.Array, "M H W 4"]) -> Float[jax.Array, "M R H W"]:
         network = thaw()
         return jax.lax.map(lambda image: score(network, image), images)
 
@@ -59,7 +60,9 @@ def grasp_summary(model: grasp.GraspNet, *, table: bool = True) -> ScoreSummary:
         return planner.summarize_whole(plain_scorer(model, table=table))
     thaw = _frozen(model)
 
-    def summarize(now: jax.Array, images: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def summarize(
+        now: Float[jax.Array, "H W 4"], images: Float[jax.Array, "P H W 4"], wanted: Bool[jax.Array, " P"]
+    ) -> tuple[Float[jax.Array, " Q"], Float[jax.Array, " Q"]]:
         return local.mean_and_best(thaw(), now, images, wanted)  # type: ignore[arg-type]
 
     return summarize

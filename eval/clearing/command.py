@@ -70,14 +70,11 @@ def clear(
       threshold: grasp at once above this score.
       released: add the clauses of DIPN's released code: a lone object is grasped, a push must raise the best
         score, gamma discounts only pushes after which that is over 0.5, and no object may come near the edge.
-      aids: what no paper has. mirrors: a grasp's score is the lowest of it and its mirror images', DIPN's prediction
-        the mean over two. fingers: halved where a finger would land on something; border: also out of sight. table: 0
-        on empty table. top: of nearly equal scores the highest thing's counts. still: tiny predicted motions are not
-        drawn. memory: halved for grasps like one that missed, as long as the table looks the same around it.
+      aids: what no paper has; docs/concepts.md says what each does. --aids with nothing behind it: none of them.
       label: for the report, what distinguishes this evaluation from others of its method, such as the data learnt from.
       seed: random seed of scenes, perturbations, noise and candidates.
       engine: physics engine.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
       share: which part of the tables this worker clears.
       launch: where tables are cleared; as tasks, all shards are made and put together.
     """

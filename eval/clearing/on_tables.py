@@ -41,7 +41,7 @@ def load(
       UserError: a network that the method needs was not given, or is another; or a camera for `physics+gn`.
     """
     found, runs = methods.find(method), networks.runs(method)
-    if found.build is None:
+    if found.needs_state:
         if camera.noisy or camera.masks != "true":
             raise UserError(f"--method {method}: decides on the simulator's state; give --masks true, and no noise")
         scorer, summarize = methods.gn_scores(runs["grasp"], configs[0])

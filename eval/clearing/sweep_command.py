@@ -69,7 +69,7 @@ def sweep(
       aids: what no paper has, as of dipn-eval clear.
       seed: random seed of scenes, perturbations and candidates.
       engine: physics engine.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
       share: which part of the tables, and of the scenes of --pushes, this worker takes.
       launch: where tables are cleared; as tasks, all shards are made and put together.
     """

@@ -55,7 +55,7 @@ def grasp(
       aids: what no paper has, as of dipn-eval clear; still is not about grasps.
       camera: what GN sees; masks do not matter to it.
       engine: physics engine.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
       ranges: the ranges that random objects are drawn from.
       share: which part of the tables this worker tries, for dipn-eval merge.
       launch: where grasps are tried; as tasks, all shards are made and put together.

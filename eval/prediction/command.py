@@ -49,7 +49,7 @@ def predict(
       objects: number of objects in a scene.
       seed: random seed of scenes and pushes, which are never those of training data.
       engine: the engine whose result counts as the truth.
-      threads: that native simulates on; one a core if not given.
+      threads: threads of the native engine; one per core by default.
       physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
       segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
       ranges: the ranges that random objects are drawn from.

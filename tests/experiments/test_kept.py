@@ -110,10 +110,29 @@ def test_a_difference_that_may_be_nothing_is_not_bold(tmp_path: pathlib.Path) ->
     assert "+0.0 [" in text and "**" not in text
 
 
+def test_hindsight_chooses_the_better_table_by_table(tmp_path: pathlib.Path) -> None:
+    rows = {
+        "table/hard/shipped/all/dipn+gn/0": [5, 5, 5, 5],
+        "table/hard/shipped/all/dipn+gn+actions/0": [5, 9, 6, 7],
+        "table/hard/shipped/all/gn/0": [8, 5, 6, 5],
+    }
+    listed, results = _kept(tmp_path, rows)
+    results.found["table/hard/shipped/all/gn/0"]["rows"][3][3] -= 1  # fewer actions, but an object is left
+    values = clearing_tables.numbers(listed, results)
+    assert values["hindsight/hard/grasps"] == 5 + 5 + 6 + 7
+    assert values["hindsight/hard/efficiency_all_less"] == pytest.approx(20 / 23 - 1)
+    assert "| the better of gn and dipn+gn+actions, in hindsight | 4 |" in clearing_tables.of_methods(
+        values, "hard", "all"
+    )
+    del results.found["table/hard/shipped/all/gn/0"]
+    assert "hindsight" not in "".join(clearing_tables.numbers(listed, results))
+
+
 def test_every_group_is_compared_with_dipn_gn_on_its_own_tables() -> None:
     rivals = {
         "table/hard/paper/bare/vpg": "table/hard/paper/bare/dipn+gn",
         "masks/random-10/true": "table/random-10/shipped/all/dipn+gn",
+        "hindsight/random-10": "table/random-10/shipped/all/dipn+gn",
         "changed/heavy/gn": "changed/heavy/dipn+gn",
         "noise/holes": "table/heldout/shipped/all/dipn+gn",
         "aids/alone/table": "table/heldout/shipped/all/dipn+gn",
