@@ -1,5 +1,5 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html
-# make test   lint, types, and the tests that take seconds; make test-slow: the others
+# make test   lint, types and the quick tests; make test-slow: the others, which compile, train or simulate for long
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
 # make mutants, make fuzz, make faults  the counts of docs/testing.md and docs/reliability.md (hours)
 # make push-figures, grasp-figures, clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
@@ -9,7 +9,9 @@ BIN := .venv/bin
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
-.PHONY: setup demo test test-slow lint bench mutants fuzz faults push-figures grasp-figures clear-figures clean-demo
+.PHONY: setup demo test test-slow lint bench mutants fuzz faults push-figures grasp-figures clear-figures help
+
+help: ; @sed -n 's/^# make/make/p' Makefile
 
 setup: .venv/.installed
 .venv/.installed: pyproject.toml constraints.txt
@@ -37,4 +39,3 @@ clear-figures: setup ; $(BIN)/python -m experiments.clearing
 mutants: setup ; $(INSTALL) '.[dev,mutants]' && $(BIN)/python -m experiments.mutants
 fuzz: setup ; $(BIN)/python -m experiments.fuzz
 faults: setup ; $(BIN)/python -m experiments.faults
-clean-demo: ; rm -rf demo
