@@ -10,7 +10,6 @@ PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e
 
 .PHONY: setup demo test test-slow lint bench mutants fuzz faults push-figures grasp-figures clear-figures help
-
 help: ; @sed -n 's/^# make/make/p' Makefile
 
 setup: .venv/.installed
