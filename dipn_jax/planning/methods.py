@@ -58,12 +58,13 @@ class Policy:
           missed: grasps (rotation, row, col) that missed on this table as it is.
 
         Raises:
-          UserError: the observation is none of those that `dipn_jax.check_observation` lets through, or this process
-            was forked after JAX had been used.
+          UserError: the observation is none of those that `dipn_jax.check_observation` lets through, all that lies on
+            the table is below the gripper's reach, or this process was forked after JAX had been used.
         """
         if not observed.is_traced(observation):
             forking.check()
             observed.check_observation(observation)
+            observed.require_reach(observation)
         return self.act(key, observation, missed, self.rule, self.distances)
 
     def with_config(self, config: PolicyConfig) -> Policy:

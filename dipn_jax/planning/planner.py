@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Key
 
 from dipn_jax.planning import candidates, memory
-from dipn_jax.sight import fingers, imagine, masks, render
+from dipn_jax.sight import fingers, imagine, masks, observed, render
 from dipn_jax.structs import Array, Candidates, Decision, Observation, Push, Pytree
 
 Predictor = Callable[[Observation, Push], jax.Array]
@@ -182,6 +182,7 @@ def _count_actions(
     return decision.replace(is_push=cost < now, value_now=-now, value_push=-cost)
 
 
+@observed.guarded
 @functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "summarize", "estimate"))
 def decide(
     key: Key[Array, ""],
@@ -219,6 +220,9 @@ def decide(
     Returns:
       The decision. A push is chosen when gamma times the mean score of all grasps on its predicted image
       exceeds the mean score now; a push that would move any centre out of the workspace is dropped.
+
+    Raises:
+      UserError: the observation is none of those that `dipn_jax.check_observation` lets through.
     """
     found = find_candidates(key, observation, scorer, rule, count=count, distance=distance, missed=missed)
     if estimate is not None:

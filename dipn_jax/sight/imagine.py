@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from dipn_jax import geometry
-from dipn_jax.sight import render
+from dipn_jax.sight import observed, render
 from dipn_jax.structs import ABSENT, Array, Observation
 from dipn_jax.workspace import WORKSPACE
 
@@ -15,6 +15,7 @@ WINDOW = 80
 """Pixels around a moved mask's centroid; wider than the renderer's window, since a half-hidden mask is off centre."""
 
 
+@observed.guarded
 @jax.jit
 def imagine(observation: Observation, centers: Float[Array, "N 2"], motion: Float[Array, "N 3"]) -> Observation:
     """Predict the observation after every object has moved rigidly in the plane.
@@ -32,6 +33,9 @@ def imagine(observation: Observation, centers: Float[Array, "N 2"], motion: Floa
 
     Returns:
       The predicted observation; where two objects overlap, the higher one is seen.
+
+    Raises:
+      UserError: the observation is none of those that `dipn_jax.check_observation` lets through.
     """
     label, pixels = observation.label, observation.label.shape[0]
     target = geometry.metres_to_pixels(centers + motion[:, :2])

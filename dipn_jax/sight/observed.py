@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 import jax
 import numpy as np
 
+from dipn_jax import forking
 from dipn_jax.errors import UserError
-from dipn_jax.structs import ABSENT
-from dipn_jax.workspace import WORKSPACE
+from dipn_jax.structs import ABSENT, Observation
+from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 
+F = TypeVar("F", bound=Callable[..., Any])
 LOWEST, HIGHEST = -0.05, 1.0
 """Metres above the table between which heights lie; in millimetres, a table with anything on it is higher."""
 
@@ -18,7 +22,7 @@ LOWEST, HIGHEST = -0.05, 1.0
 def check_observation(observation: Any) -> None:
     """Raise an error with one line for an observation that no network can judge.
 
-    A policy of `dipn_jax.load_policy` does this by itself; `dipn_jax.decide` and `dipn_jax.imagine` do not.
+    Policies of `dipn_jax.load_policy`, `dipn_jax.decide` and `dipn_jax.imagine` do this by themselves.
 
     Example:
       dipn_jax.check_observation(dipn_jax.Observation(height, color, label, slots=10))
@@ -52,6 +56,34 @@ def check_observation(observation: Any) -> None:
 def is_traced(observation: Any) -> bool:
     """Return whether this is called while a program is traced, when there are no numbers yet."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(observation))
+
+
+def guarded(function: F) -> F:
+    """Return a compiled function that first checks the observation it is given, unless it is being traced; a decorator.
+
+    A forked process in which JAX would hang is refused, too (`forking.check`).
+    """
+
+    @functools.wraps(function)
+    def checked(*positional: Any, **named: Any) -> Any:
+        for each in (*positional, *named.values()):
+            if isinstance(each, Observation) and not is_traced(each):
+                forking.check()
+                check_observation(each)
+        return function(*positional, **named)
+
+    return cast(F, checked)
+
+
+def require_reach(observation: Observation) -> None:
+    """Raise a UserError where there are objects, and none is high enough for the fingers to close on."""
+    objects = np.asarray(observation.label) != ABSENT
+    highest = np.asarray(observation.height)[objects].max(initial=-np.inf)
+    if objects.any() and highest <= LOWEST_TIP:
+        raise UserError(
+            f"observation: no object is higher than {1000 * highest:.0f} mm, and the fingers close "
+            f"{1000 * LOWEST_TIP:.0f} mm above the table; take away what lies flat, or label it {ABSENT}"
+        )
 
 
 def _map(name: str, values: Any, shape: tuple[int, ...], kind: type, about: str) -> np.ndarray:

@@ -67,8 +67,27 @@ def test_a_policy_refuses_it_before_it_decides() -> None:
             POLICY(jax.random.key(0), bad)
 
 
+def test_what_decides_and_imagines_refuses_it_too() -> None:
+    bad = _seen(height=_with(np.nan))
+    with pytest.raises(dipn_jax.UserError, match="1 values are NaN"):
+        dipn_jax.imagine(bad, np.zeros((3, 2)), np.zeros((3, 3)))
+    with pytest.raises(dipn_jax.UserError, match="1 values are NaN"):
+        dipn_jax.decide(jax.random.key(0), bad, None, None, count=2)
+    with pytest.raises(dipn_jax.UserError, match="1 values are NaN"):
+        dipn_jax.decide(key=jax.random.key(0), observation=bad, predictor=None, scorer=None)
+
+
+def test_a_table_on_which_all_lies_flat_is_refused_and_an_empty_one_is_not() -> None:
+    label = np.full(SIDE, -1, np.int32)
+    label[7, 5:9] = 1
+    with pytest.raises(dipn_jax.UserError, match="no object is higher than 5 mm, and the fingers close 20 mm above"):
+        POLICY(jax.random.key(0), _seen(height=_with(0.005), label=label))
+    assert POLICY(jax.random.key(0), _seen(height=_with(0.03), label=label)) == "decided"
+    assert POLICY(jax.random.key(0), _seen()) == "decided"
+
+
 def test_what_a_camera_sees_passes() -> None:
-    noisy = _seen(height=_with(-0.004), label=np.full(SIDE, 2, np.int64))
+    noisy = _seen(height=_with(-0.004) + _with(0.05, 9), label=np.full(SIDE, 2, np.int64))
     for good in (_seen(), noisy, jax.tree.map(jax.numpy.asarray, _seen())):
         dipn_jax.check_observation(good)
         assert POLICY(jax.random.key(0), good) == "decided"
