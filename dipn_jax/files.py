@@ -51,14 +51,20 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
     """Return a path that a user gave with `~` expanded, and absolute; links in it stay.
 
     Raises:
-      UserError: there is no such home folder, or it is a URL.
+      UserError: there is no such home folder, it is a URL, or a link that leads back to itself.
     """
     if address := addresses.url(path):
         raise UserError(f"{address}: a URL, which this option does not take; give a path")
     try:
-        return pathlib.Path(path).expanduser().absolute()
+        found = pathlib.Path(path).expanduser().absolute()
     except RuntimeError:
         raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
+    try:
+        found.stat()
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise UserError(f"{path}: a link that leads back to itself; delete it, or give another path") from None
+    return found
 
 
 def with_absolute_paths(value: Any, *, urls: bool = False) -> Any:

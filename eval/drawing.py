@@ -42,6 +42,14 @@ def image(figure: Any, path: pathlib.Path) -> str:
     return pages.picture(stream.getvalue(), path.stem)
 
 
+def write(figure: Any, path: pathlib.Path) -> None:
+    """Write a figure as a PNG file, whole or not at all."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=130)
+    plt.close(figure)
+    files.write_atomically(path, stream.getvalue())
+
+
 def show(axis: Any, picture: np.ndarray, title: str = "") -> None:
     """Draw a picture `[224, 224, 3]` of the workspace, y up."""
     half = WORKSPACE.half

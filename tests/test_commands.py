@@ -47,6 +47,29 @@ def test_a_name_with_a_line_break_is_quoted_on_one_line(call, tmp_path: pathlib.
     _one_line(call("eval", "merge", named, "--out", tmp_path / "c"), "a?b.json")
 
 
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [
+        ("datagen", ("images", "--episodes", 4, "--out")),
+        ("datagen", ("export", "data", "--format", "npz", "--out")),
+        ("datagen", ("info", "data", "--html")),
+        ("train", ("grasp-pretrain", "--data", "data", "--out")),
+        ("train", ("export", "--run", "builtin", "--out")),
+        ("train", ("export", "--run", "builtin", "--format", "safetensors", "--out")),
+        ("eval", ("clear", "--method", "gn", "--grasp-net", "builtin", "--out")),
+        ("eval", ("merge", "data", "--out")),
+        ("eval", ("clear", "--method", "gn", "--out", "c", "--cases")),
+    ],
+)
+def test_a_link_to_itself(
+    stage: str, words: tuple[object, ...], call, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("loop").symlink_to("loop")
+    _one_line(call(stage, *words, "loop"), "loop: a link that leads back to itself")
+    assert os.readlink("loop") == "loop" and os.listdir() == ["loop"]
+
+
 def test_a_disk_that_names_a_file_with_a_line_break_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     def work() -> None:
         raise OSError(28, "No space left on device", "a\nb")

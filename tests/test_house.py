@@ -186,6 +186,13 @@ def test_files_are_renamed_in_one_place() -> None:
             assert not renaming or path == ROOT / "dipn_jax" / "files.py", f"{path}: {renaming}"
 
 
+def test_figures_of_evaluations_are_written_whole() -> None:
+    """`drawing` draws into memory and hands the bytes to `files.write_atomically`."""
+    for path in (ROOT / "eval").rglob("*.py"):
+        called = {name for name, _ in _calls(path) if name.endswith(".savefig")}
+        assert not called or path == ROOT / "eval" / "drawing.py", f"{path}: {called}"
+
+
 def test_no_file_is_longer_than_300_lines() -> None:
     lines = {
         path.relative_to(ROOT): path.read_text().count("\n")

@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import os
 import pathlib
-import resource
 import time
 
 import jax
 import tensorboardX
 
 from dipn_jax import files, typed
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 
 def last(out: pathlib.Path) -> dict[str, float]:
@@ -55,7 +59,7 @@ class Log:
             os.fsync(stream.fileno())  # before the step that it belongs to is saved
         (before, then), now = self._at, time.monotonic()
         self._at = step, now
-        speed = {"examples_per_s": (step - before) * self._batch / max(now - then, 1e-9), "peak_memory_mb": _peak()}
+        speed = {"examples_per_s": (step - before) * self._batch / max(now - then, 1e-9), **_peak()}
         for name, value in (values | speed).items():
             self._events.add_scalar(name, value, step)
 
@@ -65,8 +69,11 @@ class Log:
             self._events.close()
 
 
-def _peak() -> float:
+def _peak() -> dict[str, float]:
+    """Return the most memory that was needed so far in MB, by its name; nothing where the system does not say it."""
     found = jax.local_devices()[0].memory_stats()
     if found and "peak_bytes_in_use" in found:
-        return float(found["peak_bytes_in_use"]) / 1e6
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        return {"peak_memory_mb": float(found["peak_bytes_in_use"]) / 1e6}
+    if resource is None:
+        return {}
+    return {"peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3}

@@ -25,7 +25,7 @@ from flax import nnx
 from dipn_jax import console, files, forking, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
-from dipn_jax.storage import quiet, stored_step
+from dipn_jax.storage import owner, quiet, stored_step
 
 WANTED = "give a run (the --out of dipn-train), one step of it (RUN@STEP) or that step's folder (RUN/checkpoints/STEP)"
 """What is accepted where a network is asked for, for messages."""
@@ -133,15 +133,21 @@ def _system_error(error: Exception) -> str | None:
 def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
     """Copy the weights of the newest whole step of a run to `out`, without what only training needs.
 
+    What was exported there before is replaced.
+
     Raises:
-      UserError: as `load_network`.
+      UserError: as `load_network`; or `out` holds a training, or somebody else has it.
     """
     model = load_network(run, network=network)
     folder, meta = newest(find(run, network=network))  # type: ignore[misc]
     known = ("format_version", "network", "network_config", "step", "versions", "sha256")
     extra = {key: value for key, value in meta.items() if key not in known}
     config = config_from_json(network, meta["network_config"])
-    save(out, int(folder.name), {"model": nnx.state(model)}, network=network, config=config, extra=extra)
+    with owner.owned(out):
+        if (out / "config.json").exists() or any((step / "train").exists() for step in _steps(out)):
+            raise UserError(f"--out {out}: holds a training; give another folder")
+        parts = {"model": nnx.state(model)}
+        save(out, int(folder.name), parts, network=network, config=config, extra=extra, keep=1)
 
 
 def _whole(folder: pathlib.Path) -> dict[str, Any] | None:

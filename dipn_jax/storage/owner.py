@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import fcntl
 import json
 import os
 import pathlib
@@ -13,6 +12,11 @@ from collections.abc import Iterator
 
 from dipn_jax import console, files, typed
 from dipn_jax.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 @contextlib.contextmanager
@@ -49,6 +53,8 @@ def owned(out: pathlib.Path) -> Iterator[None]:
 def _locked(path: pathlib.Path) -> tuple[int, pathlib.Path]:
     """Return a descriptor of a file that this process has to itself, and its path."""
     while True:
+        if fcntl is None:
+            return _exclusive(path.with_name("owner.exclusive.json"))
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -109,6 +109,11 @@ def _stored(part: pathlib.Path) -> dict[str, Any]:
 @contextlib.contextmanager
 def _reading(part: pathlib.Path) -> Iterator[None]:
     """Turn what goes wrong into one line: what is missing or damaged, Orbax and TensorStore say in many ways."""
+    jax.devices()  # where there is none, the command says so; it is not the file's fault
+    if not part.is_dir():
+        exported = "dipn-train export writes none: start from it by --init, in another --out"
+        advice = exported if part.name == "train" else "train again"
+        raise UserError(f"checkpoint {part}: cannot be read (there is none); {advice}")
     try:
         yield
     except Exception as error:

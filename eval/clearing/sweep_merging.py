@@ -16,7 +16,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
 from dipn_jax.storage.arrays import Form
 
-from .. import metrics, shares
+from .. import drawing, metrics, shares
 from ..shares import PART, Part
 from . import merging, sweeping
 
@@ -89,5 +89,5 @@ def finish(
     """
     if errors is not None:
         values = values | sweeping.error_rates(errors, names[:-1])
-    sweeping.figure(values).savefig(out / "sweep.png", dpi=130)
+    drawing.write(sweeping.figure(values), out / "sweep.png")
     return values

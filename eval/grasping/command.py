@@ -75,7 +75,7 @@ def grasp(
     from dipn_jax.storage import checkpoint, owner, resume
     from dipn_jax.world import scenes
 
-    from .. import curves, spread
+    from .. import curves, drawing, spread
     from ..clearing import lockstep
     from . import merging, success
 
@@ -123,5 +123,5 @@ def grasp(
             values = merging.finish(out, found, tables, others=others, online=online)
         else:
             values = online or {}
-            curves.grasp_figure(values).savefig(out / "curve.png", dpi=130)
+            drawing.write(curves.grasp_figure(values), out / "curve.png")
         options.finish(out, values, settings, partial)

@@ -12,7 +12,7 @@ from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
 
-from .. import curves
+from .. import curves, drawing
 from ..clearing import merging as clearing
 from ..clearing.instances import Instance
 from ..clearing.lockstep import Outcome
@@ -82,7 +82,7 @@ def finish(
     alone = rates.label_rates(found)
     values = (online or {}) | rates.rates(found, tables, others=others)
     values |= {f"labels_of_single_objects/{key}": value for key, value in alone.items()}
-    rates.reliability_figure(values).savefig(out / "reliability.png", dpi=130)
+    drawing.write(rates.reliability_figure(values), out / "reliability.png")
     if online is not None:
-        curves.grasp_figure(values).savefig(out / "curve.png", dpi=130)
+        drawing.write(curves.grasp_figure(values), out / "curve.png")
     return values

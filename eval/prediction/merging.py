@@ -13,7 +13,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
 from dipn_jax.storage.arrays import Form
 
-from .. import curves
+from .. import curves, drawing
 from ..shares import PART, Part
 from . import push_errors
 from .push_errors import DISTANCES
@@ -85,6 +85,6 @@ def finish(out: pathlib.Path, rows: Mapping[str, np.ndarray], compared: Sequence
     kept = {key: value for key, value in values.items() if not any(f"/{name}/" in key for name in compared)}
     values = kept | curves.push_summary(values, compared)
     for which in ("all", "moved") if compared else ():
-        curves.push_figure(values, which=which).savefig(out / f"curve-{which}.png", dpi=130)
+        drawing.write(curves.push_figure(values, which=which), out / f"curve-{which}.png")
         files.write_text(out / f"curve-{which}.md", curves.push_table(values, which=which))
     return values

@@ -13,7 +13,7 @@ from flax import nnx
 from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.storage import checkpoint, resume
+from dipn_jax.storage import checkpoint, owner, resume, stored_step
 
 CONFIG = GraspConfig(width=8)
 BUILTIN = pathlib.Path("builtin")
@@ -198,3 +198,35 @@ def test_what_tensorstore_says_of_a_full_disk_is_understood(code: str) -> None:
     said = f"{code}: Error writing local file: Failed to write [OS error 28: ENOSPC No space left on device]"
     assert checkpoint._system_error(ValueError(said)) == "No space left on device"
     assert checkpoint._system_error(ValueError("another shape")) is None
+
+
+def test_an_export_replaces_an_export_and_never_a_training(tmp_path: pathlib.Path) -> None:
+    run, out, training = (tmp_path / name for name in ("run", "out", "training"))
+    for step in (5, 9):
+        _save(run, step)
+        checkpoint.export(run, out, network="grasp")
+    assert [path.name for path in (out / "checkpoints").iterdir()] == ["00000009"]
+    parts = {"model": nnx.state(checkpoint.build("grasp", CONFIG)), "train": {"x": jnp.zeros(2)}}
+    checkpoint.save(training, 1, parts, network="grasp", config=CONFIG, extra={})
+    with pytest.raises(UserError, match=f"--out {training}: holds a training"):
+        checkpoint.export(run, training, network="grasp")
+    files.write_json(tmp_path / "begun" / "config.json", {})
+    with pytest.raises(UserError, match="holds a training"):
+        checkpoint.export(run, tmp_path / "begun", network="grasp")
+    with owner.owned(out), pytest.raises(UserError, match="in use"):
+        checkpoint.export(run, out, network="grasp")
+    (step,) = (out / "checkpoints").iterdir()
+    with pytest.raises(
+        UserError,
+        match=r"train: cannot be read \(there is none\); dipn-train export writes none: start from it by --init",
+    ):
+        checkpoint.restore(step, "train", {"x": jnp.zeros(2)})
+
+
+def test_a_missing_device_is_not_taken_for_a_damaged_file(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _save(tmp_path, 1)
+    monkeypatch.setattr(jax, "devices", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        stored_step.arrays(tmp_path / "checkpoints" / "00000001" / "model")

@@ -12,6 +12,7 @@ import sys
 from typing import Any
 
 import pytest
+from dipn_jax.train import log
 
 from dipn_jax.errors import UserError
 from dipn_jax.storage import owner
@@ -63,6 +64,16 @@ def test_without_locks_the_file_is_made_exclusively_and_that_is_said(
     path.write_text(json.dumps({"host": socket.gethostname(), "pid": ended.pid, "started": "today"}))
     with owner.owned(tmp_path / "run"):
         assert json.loads(path.read_text())["pid"] == os.getpid()
+
+
+def test_a_system_without_file_locks_has_owners_all_the_same(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(owner, "fcntl", None)
+    monkeypatch.setattr(log, "resource", None)
+    with owner.owned(tmp_path / "run"), pytest.raises(UserError, match="in use"), owner.owned(tmp_path / "run"):
+        pass
+    assert not (tmp_path / "run").exists() and log._peak() == {}
 
 
 def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.Path) -> None:
