@@ -218,7 +218,7 @@ def test_an_export_replaces_an_export_and_never_a_training(tmp_path: pathlib.Pat
     (step,) = (out / "checkpoints").iterdir()
     with pytest.raises(
         UserError,
-        match="/train: cannot be read .* start from it by --init",
+        match=r"/train: cannot be read .* start from it by --init",
     ):
         checkpoint.restore(step, "train", {"x": jnp.zeros(2)})
 
