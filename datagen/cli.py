@@ -92,7 +92,7 @@ def push(
 ) -> None:
     """Make push episodes: a settled scene, one 10 cm push, poses at every centimetre.
 
-    About two minutes on two cores for 1,500 episodes:
+    1,500 episodes take about a minute on two cores:
       dipn-datagen push --out data/push --episodes 1500
 
     The same pushes at three distances, each ended by its own retreat:
@@ -146,7 +146,7 @@ def grasp(
 ) -> None:
     """Make grasp episodes: a settled scene, one grasp, held or not.
 
-    At random foreground pixels and angles; 3,000 episodes take about three minutes on two cores:
+    At random foreground pixels and angles; 3,000 episodes take a little over a minute on two cores:
       dipn-datagen grasp --out data/grasp --episodes 3000
 
     Half where a network would grasp, a quarter where it is unsure, the others random:
