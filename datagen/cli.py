@@ -53,15 +53,12 @@ class Work:
 DEFAULT_WORK = Work()
 """One worker that makes everything, with the engine that is faster here."""
 
-OWN = ("out", "shard", "of", "threads", "launcher", "num_cpus", "num_gpus")
-"""Options that every worker has of its own."""
-
 
 def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *, scorer: Scorer | None = None) -> None:
     """Generate what `job` says; `given` are the options that the command was called with, to be kept."""
     from .generate import generate
 
-    command = command_words.words(COMMANDS[job.kind], given, without=OWN)
+    command = command_words.words(COMMANDS[job.kind], given, without=command_words.WORKER_OPTIONS)
     elsewhere = None
     if work.launch.spreads:
         from . import spread

@@ -7,6 +7,9 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+WORKER_OPTIONS = ("out", "shard", "of", "threads", "launcher", "num_cpus", "num_gpus")
+"""Options in which the workers of one job may differ; all others they have in common."""
+
 
 def words(command: Callable[..., Any], given: Mapping[str, Any], *, without: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the words after a command's name that give it the options `given`; those at their default are left out.

@@ -11,7 +11,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from dipn_jax import console, files, machine, typed
+from dipn_jax import command_words, console, files, machine, typed
 from dipn_jax.errors import UserError
 from dipn_jax.launch import Launch
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 PART = "part.json"
 """Name of the file that makes a folder a part."""
-OWN = ("out", "shard", "of", "threads", "launcher", "num_cpus", "num_gpus")
-"""Options that every worker has of its own."""
+OWN = command_words.WORKER_OPTIONS
+"""Options in which the workers of an evaluation may differ."""
 FORMAT_VERSION = 1
 """Version of the format; parts of another version are refused."""
 

@@ -19,6 +19,7 @@ Values = dict[str, np.ndarray]
 FRAMES = PUSH_STEPS + 1
 """Number of instants at which the poses of a push are recorded."""
 PIXELS = WORKSPACE.pixels
+"""Rows and columns of a picture."""
 MOMENTS: dict[str, tuple[str, ...]] = {
     "none": (),
     "before": ("before",),

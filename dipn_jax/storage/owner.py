@@ -1,4 +1,4 @@
-"""One owner at a time for the folder of a run or an evaluation: who has it stands in `OUT/owner.json` meanwhile."""
+"""Only one process at a time may use a run's or an evaluation's folder; `OUT/owner.json` names it."""
 
 from __future__ import annotations
 

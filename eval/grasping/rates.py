@@ -41,8 +41,9 @@ BINS = 10
 
 
 def rates(found: Arrays, tables: Sequence[Outcome] | Sequence[Instance], *, others: int) -> dict[str, Any]:
-    """Return flat metrics of what was tried on all tables: success with bootstrap 95 % intervals over tables, and
-    calibration.
+    """Return flat metrics of what was tried on all tables: success and calibration.
+
+    Success has bootstrap 95 % intervals over tables.
 
     Args:
       found: as `tried` returns it.

@@ -99,7 +99,7 @@ def predict(
             "prediction",
             share,
             total=push_errors.groups(scenes_),
-            command=command_words.words(predict, asked, without=shares.OWN),
+            command=command_words.words(predict, asked, without=command_words.WORKER_OPTIONS),
             given=settings,
             partial=partial,
             names=merging.save(out, rows, films),
