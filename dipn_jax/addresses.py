@@ -1,4 +1,4 @@
-"""URLs of object storage where a user may give them in place of a folder, and the names that a user knows folders by.
+"""URLs of object storage in place of folders, and the names by which messages call folders.
 
 A command's option of the type `Place` takes a URL; `files.with_absolute_paths` refuses them elsewhere.
 """

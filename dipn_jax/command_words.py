@@ -1,4 +1,4 @@
-"""The words of a command line that give a command its options, so that what it makes can say how it is made again."""
+"""Write the options of a command as words of a command line, so that a result can record how to make it again."""
 
 from __future__ import annotations
 

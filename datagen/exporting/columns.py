@@ -41,7 +41,7 @@ class Column:
 
     @property
     def flat_name(self) -> str:
-        """The name in a table, where an array is a flat list: it ends in the shape, such as `poses_11xNx7`."""
+        """Return the name in a table, where an array is a flat list: it ends in the shape, such as `poses_11xNx7`."""
         return "_".join([self.name, *(["x".join(map(str, self.shape))] if self.shape else [])])
 
     def lengths(self, slots: int) -> tuple[int, ...]:

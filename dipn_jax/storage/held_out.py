@@ -1,4 +1,4 @@
-"""Which episodes of a data set are held out: one rule, for training and for exports, which sees no more than sizes."""
+"""Decide which episodes of a data set are held out, by one rule for training and exports that needs only sizes."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def _exclusive(path: pathlib.Path) -> tuple[int, pathlib.Path]:
 
 
 def _read(path: pathlib.Path) -> dict[str, object]:
-    """Return what stands in the file; nothing if it is damaged or gone."""
+    """Return the content of the file; nothing if it is damaged or gone."""
     try:
         found = typed.parse(path.read_bytes())
     except (OSError, typed.Misfit):

@@ -1,7 +1,7 @@
-"""Where a data set is written: a folder, or object storage, where a shard is there once somebody has created it.
+"""Where a data set is written: a folder, or object storage.
 
-Shards are written to a folder in either case. In object storage that folder is a temporary one of this process, each
-shard is then created, which one writer wins, and nothing else is locked or renamed.
+Shards are written to a folder in either case. For object storage that folder is a temporary one of this process; each
+shard is then created in the bucket, which succeeds for one writer only, and nothing is locked or renamed.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Objects:
         return self._bucket.get(mirror.CONFIG) is not None
 
     def claim(self, claim: Claim) -> None:
-        """As `Place.claim`. Of two that begin at the same time, the second compares with what the first has written."""
+        """See `Place.claim`. If two begin at the same time, the second compares its configuration with the first."""
         path = self.folder / mirror.CONFIG
         while True:
             there = self._fetched(mirror.CONFIG)
@@ -148,7 +148,7 @@ class Objects:
             self._write({name: entry for name, entry in listed.items() if name not in names})
 
     def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
-        """As `Place.commit`; where another writer was first, it is his entry, unless his shard is a shorter one."""
+        """See `Place.commit`; a shard that another writer made first stays, unless its length differs."""
         name = _name(index)
         data = (self.folder / name).read_bytes()
         try:

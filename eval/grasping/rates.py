@@ -1,4 +1,4 @@
-"""Rates of grasps that were tried, and whether a score means what it says."""
+"""Success rates of grasps that were tried, and the calibration of their scores."""
 
 from __future__ import annotations
 
