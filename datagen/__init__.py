@@ -1,1 +1,1 @@
-"""Episodes by the thousand: `dipn-datagen`."""
+"""Make and look after data sets: `dipn-datagen`."""

@@ -1,4 +1,4 @@
-"""The page of a data set: what it holds, how often what was drawn, and pictures of a sample that can be sifted."""
+"""The page of a data set: what it holds, how often each value was drawn, and pictures of a sample to filter."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def write(folder: pathlib.Path, page: pathlib.Path, *, sample: int, seed: int) -
 
 
 def _tags(episodes: Any) -> list[dict[str, list[str]]]:
-    """Return what each episode can be sifted by: faults, shapes, distance, outcome."""
+    """Return what each episode can be filtered by: faults, shapes, distance, outcome."""
     present = np.asarray(episodes.scene.shape) != ABSENT
     found = []
     for row, fault in enumerate(np.asarray(episodes.fault)):
@@ -88,7 +88,7 @@ def _tags(episodes: Any) -> list[dict[str, list[str]]]:
 
 
 def _count(episodes: Any, counts: Counts) -> None:
-    """Add episodes `[B]` to the counts of what was drawn of what."""
+    """Add episodes `[B]` to the counts of drawn values."""
     scene = episodes.scene
     present = np.asarray(scene.shape) != ABSENT
     counts["objects on the table"].update(f"{number:3d}" for number in present.sum(-1))
@@ -102,7 +102,7 @@ def _count(episodes: Any, counts: Counts) -> None:
 
 
 def _figures(episodes: Any, numbers: np.ndarray) -> list[str]:
-    """Return a figure for each of the episodes `[B]`: before, after, the action, and what it can be sifted by."""
+    """Return a figure for each of the episodes `[B]`: before, after, the action, and what it can be filtered by."""
     before = episodes.poses[:, 0] if episodes.poses.ndim == 4 else episodes.poses
     views = [_views(episodes.scene, before)]
     if hasattr(episodes, "after"):

@@ -53,15 +53,12 @@ class Work:
 DEFAULT_WORK = Work()
 """One worker that makes everything, with the engine that is faster here."""
 
-OWN = ("out", "shard", "of", "threads", "launcher", "num_cpus", "num_gpus")
-"""Options that every worker has of its own."""
-
 
 def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *, scorer: Scorer | None = None) -> None:
     """Generate what `job` says; `given` are the options that the command was called with, to be kept."""
     from .generate import generate
 
-    command = command_words.words(COMMANDS[job.kind], given, without=OWN)
+    command = command_words.words(COMMANDS[job.kind], given, without=command_words.WORKER_OPTIONS)
     elsewhere = None
     if work.launch.spreads:
         from . import spread
@@ -92,7 +89,7 @@ def push(
 ) -> None:
     """Make push episodes: a settled scene, one 10 cm push, poses at every centimetre.
 
-    About two minutes on two cores for 1,500 episodes:
+    1,500 episodes take about a minute on two cores:
       dipn-datagen push --out data/push --episodes 1500
 
     The same pushes at three distances, each ended by its own retreat:
@@ -146,7 +143,7 @@ def grasp(
 ) -> None:
     """Make grasp episodes: a settled scene, one grasp, held or not.
 
-    At random foreground pixels and angles; 3,000 episodes take about three minutes on two cores:
+    At random foreground pixels and angles; 3,000 episodes take a little over a minute on two cores:
       dipn-datagen grasp --out data/grasp --episodes 3000
 
     Half where a network would grasp, a quarter where it is unsure, the others random:

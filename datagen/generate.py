@@ -1,5 +1,7 @@
-"""Shards of episodes. A shard is a pure function of the config and its index: every worker writes the same bytes at any
-time (with the same versions, on the same kind of processor).
+"""Make shards of episodes.
+
+A shard depends on the configuration and its index only: every worker writes the same bytes at any time (with the same
+versions, on the same kind of processor).
 """
 
 from __future__ import annotations

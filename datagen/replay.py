@@ -1,4 +1,4 @@
-"""Episodes simulated again from their records, and how far they come out from what is stored."""
+"""Simulate episodes again from their records, and measure how far they end from what is stored."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def difference(stored: Any, again: Any) -> Difference:
 
 
 def _flags(stored: Any, again: Any) -> list[str]:
-    """Return what of held objects and faults is not as stored, in words."""
+    """Return in words which held objects and faults differ from what is stored."""
     found = []
     if not isinstance(stored, PushEpisode) and (stored.held != again.held).any():
         slots = [", ".join(map(str, np.flatnonzero(each.held))) or "nothing" for each in (stored, again)]

@@ -22,7 +22,7 @@ from .generate import Elsewhere, Job
 
 
 def elsewhere(where: Launch, *, threads: int | None, network: pathlib.Path | None) -> Elsewhere:
-    """Return what makes shards as tasks.
+    """Return the function that makes shards as tasks.
 
     Args:
       where: the cluster, and what a task needs.

@@ -1,4 +1,4 @@
-"""URLs of object storage where a user may give them in place of a folder, and the names that a user knows folders by.
+"""URLs of object storage in place of folders, and the names by which messages call folders.
 
 A command's option of the type `Place` takes a URL; `files.with_absolute_paths` refuses them elsewhere.
 """
@@ -30,12 +30,12 @@ def taken(hint: Any) -> bool:
 
 
 def call(folder: pathlib.Path, name: str) -> None:
-    """Let lines for the user say `name` where `folder` stands: it is a copy of what has this name."""
+    """Show `name` instead of `folder` in messages: the folder is a copy of what has this name."""
     _names[str(folder)] = name
 
 
 def named(text: str) -> str:
-    """Return a text for the user with the folders that `call` named by their names."""
+    """Return `text` with the names that `call` gave instead of their folders."""
     for folder, name in _names.items():
         text = text.replace(folder, name)
     return text

@@ -1,4 +1,4 @@
-"""The words of a command line that give a command its options, so that what it makes can say how it is made again."""
+"""Write the options of a command as words of a command line, so that a result can record how to make it again."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import dataclasses
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
+
+WORKER_OPTIONS = ("out", "shard", "of", "threads", "launcher", "num_cpus", "num_gpus")
+"""Options in which the workers of one job may differ; all others they have in common."""
 
 
 def words(command: Callable[..., Any], given: Mapping[str, Any], *, without: Sequence[str] = ()) -> tuple[str, ...]:

@@ -137,7 +137,7 @@ def note(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """One line for the user, on standard error, about what goes on in spite of it."""
+    """Print one warning line on standard error; the command continues."""
     print(f"warning: {addresses.named(text)}", file=sys.stderr, flush=True)
 
 

@@ -127,8 +127,9 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def move(source: pathlib.Path, target: pathlib.Path) -> None:
-    """Rename a file or a folder so that a power cut leaves all of it or nothing: first its content is synced, then its
-    name.
+    """Rename a file or a folder durably: its content is synced first, then its name.
+
+    So a power cut leaves all of it under the new name, or nothing.
     """
     for path in (*source.rglob("*"), source):
         _sync(path)

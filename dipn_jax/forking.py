@@ -1,6 +1,7 @@
-"""Processes that are forked after JAX has been used: its threads are missing there, so a call of JAX waits for ever.
+"""Detect processes that were forked after JAX was used: its threads are missing there, so JAX would wait for ever.
 
-What computes calls `check` first, outside of compiled functions. Reading data sets needs no device and works there.
+Functions that compute call `check` first, outside of compiled functions. Reading data sets needs no device and works in
+such a process.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if hasattr(os, "register_at_fork"):  # Windows has no fork
 
 
 def check() -> None:
-    """Return where JAX can compute.
+    """Raise an error if this process was forked after JAX was used.
 
     Raises:
       UserError: this process was forked after JAX had been used.

@@ -1,4 +1,4 @@
-"""What a file that is read back has to look like: JSON is parsed here, and checked against a form.
+"""Parse JSON that is read back from files, and check it against a form.
 
 Whatever is in a file, reading it ends with a value that fits, or with a `Misfit` of one line, never with another error.
 """

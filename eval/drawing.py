@@ -18,7 +18,7 @@ from dipn_jax.workspace import WORKSPACE
 
 
 def label(text: str) -> str:
-    """What a user named, for a figure: `$` is no formula, bytes of a name that are no text are replaced."""
+    """Return a user's name for a figure: `$` begins no formula, and bytes that are no text are replaced."""
     readable = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     return readable.replace("$", r"\$")
 

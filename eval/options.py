@@ -20,7 +20,7 @@ def check(out: pathlib.Path, seed: int, **counts: int) -> None:
 
 
 def settings(given: dict[str, Any]) -> dict[str, Any]:
-    """The options of a command by name, without those on which no result depends."""
+    """Return the options of a command by name, without those on which no result depends."""
     return {key: value for key, value in given.items() if key not in ("threads", "share", "launch")}
 
 
@@ -34,7 +34,7 @@ def plain(value: Any) -> Any:
 
 
 def recorded(settings: dict[str, Any], partial: resume.Partial) -> dict[str, Any]:
-    """What `settings.json` records: the options, which step of each network was measured, and by which sources."""
+    """Return what `settings.json` records: the options, which step of each network was measured, and the sources."""
     return {key: plain(value) for key, value in settings.items()} | {
         "networks": partial.networks,
         "files": partial.files,

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 PART = "part.json"
 """Name of the file that makes a folder a part."""
-OWN = ("out", "shard", "of", "threads", "launcher", "num_cpus", "num_gpus")
-"""Options that every worker has of its own."""
 FORMAT_VERSION = 1
 """Version of the format; parts of another version are refused."""
 

@@ -19,8 +19,10 @@ from dipn_jax.errors import UserError
 from experiments import command, pages
 from experiments.runs import Recipe, Run
 
-PUSHES, GRASPS = 1000, 1000
-"""Episodes that the two networks learn from."""
+PUSHES = 1000
+"""Number of pushes that DIPN learns from."""
+GRASPS = 1000
+"""Number of grasps that GN learns from."""
 
 
 def list_runs(root: pathlib.Path) -> list[Run]:

@@ -104,7 +104,7 @@ RATES = {"gn": "GN, until the table is empty", "gn_first": "GN, first grasp", "r
 
 def success_table(values: dict[str, Any]) -> str:
     """Return a table of the shipped network's success, with 95 % intervals, and what physics allows."""
-    titles = [*RATES.values(), "tables", "grasps", "tables emptied", "ceiling", "ECE"]
+    titles = [*RATES.values(), "tables", "grasps", "tables emptied", "best case", "ECE"]
     lines = ["| | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
     for row, title in ROWS.items():
         if f"{row}/attempts" not in values:
@@ -114,8 +114,8 @@ def success_table(values: dict[str, Any]) -> str:
             value, low, high = (100 * values[f"{row}/grasp_success/{name}{end}"] for end in ("", "_low", "_high"))
             cells.append(f"{value:.1f} [{low:.1f}, {high:.1f}] %")
         cells += [str(values[f"{row}/{key}"]) for key in ("scenes", "attempts", "table/ended_cleared")]
-        ceiling = values.get(f"{row}/other_grasps/ceiling")
-        cells += ["" if ceiling is None else f"{100 * ceiling:.1f} %"]
+        best_case = values.get(f"{row}/other_grasps/ceiling")
+        cells += ["" if best_case is None else f"{100 * best_case:.1f} %"]
         cells += [f"{values[f'{row}/expected_calibration_error']:.3f}"]
         lines.append(f"| {title} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

@@ -5,7 +5,7 @@
     python -m experiments.mutants --list                         # modules, and the tests of each
 
 Cosmic Ray (the extra `mutants`) makes the mutants, in a scratch copy of this checkout. Interrupted, the same command
-continues. `docs/testing.json` and the table of `docs/testing.md` have the result of every module that is complete.
+continues. `docs/testing.json` and the table of `docs/testing.md` have the result of every module that was measured.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import pathlib
 import sys
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -54,31 +55,32 @@ TESTS: dict[str, tuple[str, ...]] = {
 
 PAGE = "testing"
 """Name of the page in docs and of its JSON."""
-_HEADING = "| module | mutants | killed | survivors |\n| --- | --- | --- | --- |\n"
+_HEADING = ("| module | mutants | killed | survivors |", "| --- | --- | --- | --- |")
 
 
-def table(values: dict[str, Any]) -> str:
-    """Return the table of the page as Markdown.
+def section(values: dict[str, Any]) -> str:
+    """Return the page's table of measured modules, and one sentence that names the others, as Markdown.
 
     Args:
-      values: module -> its `mutants_session.result`; a module that is missing was not run.
+      values: module -> its `mutants_session.result`; a module that is missing was not measured.
     """
-    rows = []
+    lines = [*_HEADING]
     for module in TESTS:
         if found := values.get(module):
             share = 100 * found["killed"] / max(found["mutants"], 1)
-            cells = [str(found["mutants"]), f"{found['killed']} ({share:.1f} %)", str(len(found["survivors"]))]
-        else:
-            cells = ["not run", "", ""]
-        rows.append(f"| `{module}` | {' | '.join(cells)} |\n")
-    return _HEADING + "".join(rows)
+            lines.append(
+                f"| `{module}` | {found['mutants']} | {found['killed']} ({share:.1f} %) | {len(found['survivors'])} |"
+            )
+    if missing := [f"`{module}`" for module in TESTS if module not in values]:
+        lines += ["", *textwrap.wrap(f"Not measured yet: {', '.join(missing)}.", 120, break_on_hyphens=False)]
+    return "\n".join(lines) + "\n"
 
 
 def write_page(values: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
-    """Write `testing.json`, and its table into `testing.md`."""
+    """Write `testing.json`, and its section into `testing.md`."""
     page = docs / f"{PAGE}.md"
     files.write_json(docs / f"{PAGE}.json", values)
-    files.write_text(page, pages.with_table(files.read_text(page), table(values)))
+    files.write_text(page, pages.with_tables(files.read_text(page), section(values)))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

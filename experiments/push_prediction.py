@@ -103,12 +103,13 @@ SHIFTS = {
 
 COLUMNS = [(f"{c}cm", which) for c in curves.DISTANCES for which in ("all", "moved")]
 """Distance and objects of each column of errors."""
+TITLES = [f"{at.replace('cm', ' cm')}, {which}" for at, which in COLUMNS]
+"""Titles of these columns."""
 
 
 def shift_table(values: dict[str, Any]) -> str:
-    """Return a table of the shipped network, the floor and the better baseline in worlds unlike the training data."""
-    titles = [f"{at}, {which}" for at, which in COLUMNS]
-    lines = ["| scenes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
+    """Return a table of the shipped network, the best case and a baseline in worlds unlike the training data."""
+    lines = ["| scenes | predictor | " + " | ".join(TITLES) + " |", "| --- " * (len(TITLES) + 2) + "|"]
     for shift, title in SHIFTS.items():
         for name in ("dipn", "physics", "trans"):
             keys = [f"{shift}/push_error/{name}/{at}/{which}" for at, which in COLUMNS]
@@ -123,7 +124,7 @@ def alone_table(values: dict[str, Any]) -> str:
     names = {"every": "one network for 1 to 10 cm", "only5": "trained for 5 cm", "only10": "trained for 10 cm"}
     names["found"] = "1 to 10 cm, trained on masks found in the image"
     columns = [(f"push_error{masks}", at, which) for masks in ("", "_segmented") for at, which in COLUMNS]
-    titles = [f"{at}, {which}{', found masks' * measure.endswith('segmented')}" for measure, at, which in columns]
+    titles = [f"{title}{end}" for end in ("", ", found masks") for title in TITLES]
     lines = ["| network | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
     for name, title in names.items():
         cells = []
@@ -136,8 +137,7 @@ def alone_table(values: dict[str, Any]) -> str:
 
 def unseen_table(values: dict[str, Any]) -> str:
     """Return a table on scenes of one class of shapes: a network trained without the class, and one with all."""
-    titles = [f"{at}, {which}" for at, which in COLUMNS]
-    lines = ["| shapes | predictor | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 2) + "|"]
+    lines = ["| shapes | predictor | " + " | ".join(TITLES) + " |", "| --- " * (len(TITLES) + 2) + "|"]
     predictors = {
         "DIPN, never shown them": ("without", "dipn"),
         "DIPN, shown all": ("with", "dipn"),
@@ -154,8 +154,7 @@ def unseen_table(values: dict[str, Any]) -> str:
 
 def crowd_table(values: dict[str, Any]) -> str:
     """Return a table on scenes of 8 to 15 objects: networks trained on such scenes, and on 1 to 7."""
-    titles = [f"{at}, {which}" for at, which in COLUMNS]
-    lines = ["| trained on | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
+    lines = ["| trained on | " + " | ".join(TITLES) + " |", "| --- " * (len(TITLES) + 1) + "|"]
     trained = {
         "crowd-few": "1,500 pushes, 1 to 7 objects",
         "crowd-crowded": "1,500 pushes, 8 to 15 objects",

@@ -14,6 +14,7 @@ import pathlib
 import shutil
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,7 +32,7 @@ class Promise:
 
     text: str
     tests: tuple[str, ...]  # file::name
-    counted: Callable[[dict[str, Any]], str] = lambda _: ""  # what was tried, from the page's JSON
+    counted: Callable[[dict[str, Any]], str] | None = None  # what was tried, from the page's JSON
 
 
 def _faults(values: dict[str, Any]) -> str:
@@ -61,8 +62,8 @@ def _checkpoints(values: dict[str, Any]) -> str:
 _STORAGE = "tests/dipn_jax/storage"
 PROMISES = (
     Promise(
-        "A command that is killed, or whose disk is full, loses no record that it has finished; given again, it ends "
-        "as if nothing had happened.",
+        "A command that is killed, or whose disk is full, loses no finished record; the same command, given again, "
+        "ends as if nothing had happened.",
         (
             "tests/experiments/test_faults.py::test_a_command_given_again_after_a_fault_ends_as_an_undisturbed_one",
             "tests/datagen/test_generate.py::test_a_gap_is_filled_with_the_same_bytes_and_the_rest_left_alone",
@@ -70,8 +71,8 @@ PROMISES = (
         _faults,
     ),
     Promise(
-        "A file or a step that has its name is whole, after a power cut, too: content is synced, then renamed, then "
-        "the folder is synced.",
+        "A file or step under its final name is complete, even after a power cut: its content is synced, then it is "
+        "renamed, then the folder is synced.",
         (
             "tests/dipn_jax/test_files.py::test_content_is_synced_before_a_rename_and_the_name_after_it",
             "tests/test_house.py::test_files_are_renamed_in_one_place",
@@ -79,7 +80,7 @@ PROMISES = (
         ),
     ),
     Promise(
-        "A training that was stopped and goes on ends bit for bit as one that was not (on a CPU).",
+        "On a CPU, a training that was stopped and continued ends bit for bit as one that was never stopped.",
         (
             "tests/train/test_resuming.py::test_an_interrupted_run_ends_as_an_uninterrupted_one",
             "tests/train/test_loop.py::test_learning_online_continues_where_it_was_stopped",
@@ -87,7 +88,7 @@ PROMISES = (
         ),
     ),
     Promise(
-        "A step of a run that was damaged later is noticed, named and passed over for the one before.",
+        "A damaged step of a run is noticed and named, and the step before it is used.",
         (
             f"{_STORAGE}/test_checkpoint.py::test_a_damaged_step_is_skipped",
             f"{_STORAGE}/test_checkpoint.py::test_a_damaged_newest_step_is_named_once_with_the_step_used",
@@ -96,8 +97,8 @@ PROMISES = (
         _checkpoints,
     ),
     Promise(
-        "Checkpoints are written while training goes on: what it does meanwhile does not get into them, the last one "
-        "is waited for, and one that cannot be written is one line and exit code 2.",
+        "Checkpoints are written in the background: what training does meanwhile does not change them, the run waits "
+        "for the last one, and a step that cannot be saved ends the run with one line and exit code 2.",
         (
             f"{_STORAGE}/test_saving.py::test_what_is_donated_or_changed_while_a_step_is_written_does_not_change_it",
             f"{_STORAGE}/test_saving.py::test_one_step_is_written_at_a_time_and_the_last_is_waited_for",
@@ -112,7 +113,7 @@ PROMISES = (
         ),
     ),
     Promise(
-        "A file of the user's that is damaged or strange is one line and exit code 2, not a traceback.",
+        "A damaged or malformed file from the user gives one line and exit code 2, not a traceback.",
         (
             "tests/test_commands.py::test_an_unknown_shape_in_a_case_file",
             "tests/dipn_jax/test_files.py::test_a_file_that_is_no_utf8_is_damaged",
@@ -120,7 +121,7 @@ PROMISES = (
         _fuzz,
     ),
     Promise(
-        "A folder of a training or an evaluation has one owner at a time; a second one stops and names it.",
+        "The folder of a training or an evaluation has one owner at a time; a second command stops and names it.",
         (
             f"{_STORAGE}/test_owner.py::test_the_second_is_told_who_has_it_and_a_dead_owner_does_not_block",
             "tests/train/test_loop.py::test_a_run_that_is_going_on_is_not_started_again",
@@ -128,8 +129,8 @@ PROMISES = (
         ),
     ),
     Promise(
-        "Where a file system has no locks, data sets are made, runs trained and tables cleared all the same, with one "
-        "line of warning.",
+        "On a file system without locks, data sets are still made, runs trained and tables cleared, with one line of "
+        "warning.",
         (
             "tests/datagen/test_generate.py::test_without_locks_a_data_set_is_made_all_the_same_with_one_line",
             f"{_STORAGE}/test_records.py::"
@@ -138,16 +139,16 @@ PROMISES = (
         ),
     ),
     Promise(
-        "A node or a worker of a Ray cluster that is lost costs its task only, which is tried again; data sets and "
-        "evaluations are those of one machine, byte for byte. (Skipped where Ray is not installed.)",
+        "When a node or a worker of a Ray cluster is lost, only its task is run again; data sets and evaluations are "
+        "those of one machine, byte for byte. (The tests are skipped where Ray is not installed.)",
         (
             "tests/datagen/test_spread.py::test_nodes_and_workers_that_are_lost_change_nothing",
             "tests/eval/test_shares.py::test_parts_make_the_very_evaluation_of_one_worker",
         ),
     ),
     Promise(
-        "In object storage several workers make each shard once, and one that is killed leaves whole shards only; the "
-        "next completes them to the data set of one machine, byte for byte.",
+        "In object storage each shard is kept once, however many workers make it, and a worker that is killed leaves "
+        "complete shards only; the next worker completes the data set to that of one machine, byte for byte.",
         (
             "tests/datagen/test_object_storage.py::"
             "test_racing_writers_make_each_shard_once_and_a_killed_ones_work_goes_on",
@@ -156,12 +157,12 @@ PROMISES = (
         ),
     ),
     Promise(
-        "A training that devices or processes share learns what one device learns, but for rounding; an interruption "
-        "of one process ends all with a checkpoint, from which any number of devices goes on.",
+        "A training shared by devices or processes learns what one device learns, up to rounding; interrupting one "
+        "process ends all of them with a checkpoint, from which any number of devices can continue.",
         ("tests/train/test_devices.py::test_four_devices_learn_what_one_does_and_one_goes_on_from_there",),
     ),
     Promise(
-        "Data sets are joined whole or not at all, and exports that were interrupted are continued to the same bytes.",
+        "Data sets are merged completely or not at all, and an interrupted export continues to the same bytes.",
         (
             "tests/datagen/test_merging.py::test_an_interrupted_merge_continues",
             "tests/datagen/exporting/test_export.py::test_an_interrupted_export_ends_as_an_undisturbed_one",
@@ -177,21 +178,23 @@ def cases_of(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def section(values: dict[str, Any]) -> str:
-    """Return the tables of the page as Markdown, from its JSON."""
-    lines = ["| promise | held by | tried |", "| --- | --- | --- |"]
+    """Return the page's list of promises and its table of faults as Markdown, from its JSON."""
+    paragraphs = []
     for promise in PROMISES:
-        tests = "<br>".join(f"`{test}`" for test in promise.tests)
-        lines.append(f"| {promise.text} | {tests} | {promise.counted(values)} |")
+        paragraphs += [f"**{promise.text}**", f"Held by {', '.join(f'`{test}`' for test in promise.tests)}."]
+        if promise.counted:
+            paragraphs.append(f"Tried: {promise.counted(values)}.")
+    wrapped = [textwrap.fill(each, 120, break_long_words=False, break_on_hyphens=False) for each in paragraphs]
     columns = ("tried", "lost", "repeated", "wrong", "damaged", "tracebacks")
-    lines += ["", f"| command | fault | {' | '.join(columns)} |", f"| --- | --- |{' --- |' * len(columns)}"]
+    rows = [f"| command | fault | {' | '.join(columns)} |", f"| --- | --- |{' --- |' * len(columns)}"]
     for case, kinds in cases_of(values).items():
         for kind, row in kinds.items():
-            lines.append(f"| {case} | {kind} | {' | '.join(str(row[name]) for name in columns)} |")
-    return "\n".join(lines) + "\n"
+            rows.append(f"| {case} | {kind} | {' | '.join(str(row[name]) for name in columns)} |")
+    return "\n\n".join([*wrapped, "## Faults by command", "\n".join(rows)]) + "\n"
 
 
 def write(key: str, found: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
-    """Put what an experiment found into `reliability.json` under its key, and the tables into `reliability.md`."""
+    """Put what an experiment found into `reliability.json` under its key, and its section into `reliability.md`."""
     path, page = docs / f"{PAGE}.json", docs / f"{PAGE}.md"
     values = (files.read_json(path) if path.exists() else {}) | {key: found}
     text = pages.with_tables(files.read_text(page), section(values))

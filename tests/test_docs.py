@@ -202,7 +202,7 @@ def test_the_tutorial_clears_its_table(tmp_path: pathlib.Path) -> None:
 
 
 def smaller(words: list[str]) -> tuple[str, ...]:
-    """A command of the tutorial or a how-to, made small."""
+    """Return a command of the tutorial or a how-to, made small."""
     program, name, *rest = words
     options = [
         word if before == "--distances" and ":" not in word else SMALL.get(before, word)
@@ -219,13 +219,16 @@ def smaller(words: list[str]) -> tuple[str, ...]:
 
 
 @pytest.mark.slow
-def test_the_commands_of_the_tutorial_work_at_small_scale(
+def test_the_commands_from_data_to_cleared_tables_work_at_small_scale(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(moving_picture, "PERIOD", 0.5)
     monkeypatch.setattr(moving_picture, "HOLD_FRAMES", 2)
-    for words in commands(ROOT / "docs" / "tutorial.md"):
+    recipe = commands(ROOT / "docs" / "howto" / "your_network.md")
+    recipe = recipe[: [words[-1] for words in recipe].index("results/hard") + 1]
+    recipe = [words for words in recipe if words[:2] not in (["dipn-eval", "prediction"], ["dipn-eval", "grasp"])]
+    for words in commands(ROOT / "docs" / "tutorial.md") + recipe:
         if words[0] == "python":
             moving_picture.main(pathlib.Path("results/picture"), pathlib.Path("results/clearing.gif"))
         else:

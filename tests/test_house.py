@@ -143,7 +143,14 @@ def test_conventions() -> None:
 def test_every_module_has_a_docstring() -> None:
     for package in (*PACKAGES, *TOPS):
         for path in (ROOT / package).rglob("*.py"):
-            assert not _tree(path).body or ast.get_docstring(_tree(path)), path
+            assert ast.get_docstring(_tree(path)), path
+
+
+def test_every_room_and_module_of_the_library_is_on_the_page_of_concepts() -> None:
+    rooms = (ROOT / "docs" / "concepts.md").read_text().partition("## The rooms of the code")[2].partition("\n## ")[0]
+    for name in ORDER:
+        shown = f"`dipn_jax/{name}/`" if (ROOT / "dipn_jax" / name).is_dir() else f"{name}.py`"
+        assert re.search(rf"[`/]{re.escape(shown.removeprefix('`'))}", rooms), name
 
 
 def test_the_makefile_is_short_and_its_modules_exist() -> None:

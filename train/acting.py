@@ -14,7 +14,7 @@ from flax import nnx
 from dipn_jax import structs
 from dipn_jax.engine import Engine
 from dipn_jax.networks.vpg import VPG
-from dipn_jax.planning import candidates, scorers
+from dipn_jax.planning import candidates, memory, scorers
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import fingers, render
 from dipn_jax.storage import plain
@@ -27,9 +27,9 @@ EXPLORED_AT_LEAST = 0.1
 """Share of actions whose primitive stays random. Source: VPG's released code."""
 EXPLORATION_DECAY = 0.9998
 """Factor of that share, for every action. Source: VPG's released code."""
-CHANGED_HEIGHT = 0.01
-"""Metres by which a pixel's height has to change to be counted; also the height above which it shows an object."""
-CHANGED_PIXELS = 300
+OBJECT_HEIGHT = 0.01
+"""Metres above which a pixel shows an object."""
+CHANGED_TABLE_PIXELS = 300
 """Pixels that have to change for the table to count as changed."""
 CHANGE_REWARD = 0.5
 """VPG's reward of a push that changes the scene."""
@@ -145,7 +145,7 @@ def execute(
 
 def changed(now: Look, then: Look) -> np.ndarray:
     """Return which of the tables `[T]` look different."""
-    return (np.abs(then.height - now.height) > CHANGED_HEIGHT).sum((1, 2)) > CHANGED_PIXELS
+    return (np.abs(then.height - now.height) > memory.CHANGED_HEIGHT).sum((1, 2)) > CHANGED_TABLE_PIXELS
 
 
 def push_reward(now: Look, then: Look, *, method: str) -> np.ndarray:
@@ -153,7 +153,7 @@ def push_reward(now: Look, then: Look, *, method: str) -> np.ndarray:
     different = changed(now, then)
     if method != "dqn":
         return CHANGE_REWARD * different
-    gained = (then.height > CHANGED_HEIGHT).sum((1, 2)) - (now.height > CHANGED_HEIGHT).sum((1, 2))
+    gained = (then.height > OBJECT_HEIGHT).sum((1, 2)) - (now.height > OBJECT_HEIGHT).sum((1, 2))
     better = then.grasp_value > SCORE_RISE * now.grasp_value
     reward = np.where(better, (now.grasp_value + then.grasp_value) / 2, 0.0)
     reward = np.where(gained > UNCOVERED_PIXELS, np.maximum(reward, UNCOVERED_REWARD), reward)

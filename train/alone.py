@@ -1,4 +1,4 @@
-"""Commands of `dipn-train` in a process that stops when the one that started it says so, or is no more."""
+"""Run commands of `dipn-train` in a process that stops when its parent asks for it, or has ended."""
 
 from __future__ import annotations
 

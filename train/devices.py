@@ -107,7 +107,7 @@ def placement(compute: Compute, *, batch: int) -> OneDevice:
 
 
 def join(compute: Compute) -> None:
-    """Join the other processes of the job, where there are any; before anything else is asked of JAX.
+    """Join the other processes of the job, if there are any; call this before anything else in JAX.
 
     SLURM and Open MPI tell JAX of them, and so does Kubernetes where the package `kubernetes` is installed; elsewhere
     options do.

@@ -44,7 +44,7 @@ class Kept:
         room: Room,
         about: str,
     ) -> None:
-        """Prepare to keep examples; what is not said here, `ExampleStore` says.
+        """Prepare to keep examples; `ExampleStore` explains what is not explained here.
 
         Args:
           make: as of `ExampleStore`.
@@ -71,7 +71,7 @@ class Kept:
             self._all = self._make_all()
 
     def _size(self) -> float:
-        """Return the bytes that all examples take; none where they fit whatever they are."""
+        """Return the bytes that all examples take; 0 if they fit in any case."""
         if self._count * _LARGEST <= 1e9 * self._room.memory:
             return 0.0
         some = jax.tree.leaves(self._make(_filled(np.zeros(1, int))))
@@ -84,10 +84,9 @@ class Kept:
 
 
 class ExampleStore:
-    """Examples in files that are mapped into memory: the system keeps there what it has room for.
+    """Examples in files that are mapped into memory; the operating system caches them.
 
-    They are taken up by a later process if the one that made them has closed them; after a hard stop they are made
-    anew.
+    A later process reuses them if the one that made them has closed them; after a hard stop they are made again.
     """
 
     def __init__(self, folder: pathlib.Path, make: Callable[[np.ndarray], Any], count: int, *, about: str) -> None:

@@ -1,4 +1,4 @@
-"""Losses and weights that are not finite: noticed without waiting for the device, and said in one line."""
+"""Notice losses and weights that are not finite, without waiting for the device, and report them in one line."""
 
 from __future__ import annotations
 

@@ -8,8 +8,10 @@ from typing import Self
 
 import jax
 
-FIRST, LAST = 5, 15
-"""Steps of this process between which a profile is taken; before them, programs are compiled."""
+FIRST = 5
+"""Step of this process at which a profile begins; before it, programs are compiled."""
+LAST = 15
+"""Step of this process at which the profile ends."""
 
 
 class Profiler:

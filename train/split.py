@@ -1,4 +1,4 @@
-"""Data sets that are learnt from: joined, and split into what is learnt and what is held out for the curve."""
+"""Join the data sets of a training, and split them into episodes to learn from and held-out ones for the curve."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""Data sets written in formats of other tools."""

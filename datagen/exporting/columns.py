@@ -19,6 +19,7 @@ Values = dict[str, np.ndarray]
 FRAMES = PUSH_STEPS + 1
 """Number of instants at which the poses of a push are recorded."""
 PIXELS = WORKSPACE.pixels
+"""Rows and columns of a picture."""
 MOMENTS: dict[str, tuple[str, ...]] = {
     "none": (),
     "before": ("before",),
@@ -40,7 +41,7 @@ class Column:
 
     @property
     def flat_name(self) -> str:
-        """The name in a table, where an array is a flat list: it ends in the shape, such as `poses_11xNx7`."""
+        """Return the name in a table, where an array is a flat list: it ends in the shape, such as `poses_11xNx7`."""
         return "_".join([self.name, *(["x".join(map(str, self.shape))] if self.shape else [])])
 
     def lengths(self, slots: int) -> tuple[int, ...]:

@@ -87,7 +87,7 @@ def _suits(kind: str, form: str, images: str) -> None:
 
 
 def _writer(source: Source, out: pathlib.Path, form: str, images: str) -> Writer:
-    """Return what writes a format."""
+    """Return the writer of a format."""
     if form in ("parquet", "npz"):
         from . import tables
 

@@ -1,0 +1,1 @@
+"""Files that come with the package: cases, and the trained networks."""

@@ -1,0 +1,1 @@
+"""The networks DIPN, GN and VPG, and their losses."""

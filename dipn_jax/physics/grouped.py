@@ -1,4 +1,4 @@
-"""An engine under which what happens in a scene does not depend, to the last bit, on the scenes simulated beside it."""
+"""An engine whose results for a scene do not depend, to the last bit, on the scenes simulated beside it."""
 
 from __future__ import annotations
 

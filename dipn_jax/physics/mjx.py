@@ -29,6 +29,7 @@ DEFAULTS = PhysicsConfig(
     geom_pairs=(32, 4),  # measured: at most 26 overlapping bounding spheres (10 objects, a push)
     contact_points=(80, 8),  # measured: at most 54 contacts with 7 objects, 75 with 10
 )
+"""Settings of the solver unless others are given."""
 PADDED_KEY_FRAMES = 8
 """Key frames that every trajectory is padded to, so that all primitives share one program."""
 PADDED_SAMPLES = 12

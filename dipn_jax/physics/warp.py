@@ -28,9 +28,12 @@ from dipn_jax.world.model import GRIPPER_DOF
 from dipn_jax.world.scenes import parked
 
 DEFAULTS = PhysicsConfig()
-CHUNK, CHUNK_ON_GPU = 512, 2048
-"""Most scenes simulated at once, on a CPU and on a GPU. An H200 made 209 scene seconds a second of 512 and 353 of 2,048
-(docs/benchmarks.md); more were not tried there."""
+"""Settings of the solver unless others are given."""
+CHUNK = 512
+"""Maximum number of scenes simulated at once on a CPU."""
+CHUNK_ON_GPU = 2048
+"""Maximum number of scenes simulated at once on a GPU. An H200 simulates 209 scene seconds a second with 512 and 353
+with 2,048 (docs/benchmarks.md); more were not tried."""
 
 
 class Room(NamedTuple):

@@ -23,8 +23,10 @@ from dipn_jax.world.model import GRIPPER_DOF
 
 KINDS = [(shape, part) for shape in range(len(shapes.CLASSES)) for part in np.flatnonzero(shapes.CORNERS_USED[shape])]
 """All parts of all classes."""
-VERTICES, FACES = 2 * shapes.CORNERS, shapes.CORNERS + 2
-"""Most corners and faces of a part."""
+VERTICES = 2 * shapes.CORNERS
+"""Maximum number of corners of a part."""
+FACES = shapes.CORNERS + 2
+"""Maximum number of faces of a part."""
 SHARED = ("mesh_graph", "mesh_polyvert", "mesh_polymap")
 """Fields of a MuJoCo model whose numbers count from the start of one mesh."""
 

@@ -1,0 +1,1 @@
+"""Candidate actions, Alg. 2 of the paper, and the methods that decide."""

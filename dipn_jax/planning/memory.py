@@ -1,4 +1,4 @@
-"""The memory of grasps that missed on one table, as long as it looks the same around them."""
+"""Remember grasps that missed on one table, as long as the table looks the same around them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many grasps will miss until a table is empty, as the scores of its objects tell."""
+"""Estimate how many grasps will miss before a table is empty, from the scores."""
 
 from __future__ import annotations
 

@@ -44,9 +44,7 @@ def aided_scorer(model: grasp.GraspNet, *, aids: Collection[Aid] = ALL_AIDS) -> 
 
 
 def plain_scorer(model: grasp.GraspNet, *, table: bool = True) -> Scorer:
-    """Return GN as a scorer with its scores as they are; grasps centred on empty table score 0 unless `table` is
-    False.
-    """
+    """Return GN as a scorer with its scores as they are, but 0 for grasps centred on empty table if `table` is True."""
     return _scorer(model, functools.partial(grasp.score_image, table=table))
 
 

@@ -1,0 +1,1 @@
+"""What the camera sees, what it would see after predicted motions, and masks."""

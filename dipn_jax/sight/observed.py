@@ -1,4 +1,4 @@
-"""What a camera of the user's says, checked before anything is computed from it."""
+"""Checks of an observation that a user provides."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from dipn_jax.structs import ABSENT, Observation
 from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 
 F = TypeVar("F", bound=Callable[..., Any])
-LOWEST, HIGHEST = -0.05, 1.0
-"""Metres above the table between which heights lie; in millimetres, a table with anything on it is higher."""
+LOWEST = -0.05
+"""Lowest height that is accepted (metres above the table)."""
+HIGHEST = 1.0
+"""Highest height that is accepted (metres above the table); heights given in millimetres exceed it."""
 
 
 def check_observation(observation: Any) -> None:

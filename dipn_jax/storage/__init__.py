@@ -1,0 +1,1 @@
+"""The formats on disk, data sets and checkpoints, and data sets in object storage."""

@@ -1,4 +1,4 @@
-"""What was asked for of a data set, what of it is there, and who made it.
+"""Which episodes of a data set were asked for, which exist, and who made them.
 
 `asked.json` beside the shards keeps the command that makes them, so that a gap can be named with what fills it.
 """

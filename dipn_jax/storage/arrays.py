@@ -1,4 +1,4 @@
-"""Files of named arrays (`npz`) that are read back: what is wanted is there, or a `Misfit` says what is not."""
+"""Read and write files of named arrays (`npz`); a `Misfit` says which array is missing or wrong."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
     folder, meta = newest(find(run, network=network))  # type: ignore[misc]
     known = ("format_version", "network", "network_config", "step", "versions", "sha256")
     extra = {key: value for key, value in meta.items() if key not in known}
-    config = config_from_json(network, meta["network_config"])
+    config = stored_step.config(NETWORKS[network][0], meta["network_config"])
     with owner.owned(out):
         if (out / "config.json").exists() or any((step / "train").exists() for step in _steps(out)):
             raise UserError(f"--out {out}: holds a training; give another folder")
@@ -233,11 +233,6 @@ def digest(model: nnx.Module) -> str:
     return found.hexdigest()
 
 
-def config_from_json(name: str, values: dict[str, Any]) -> Any:
-    """Return a network's config dataclass, from its values in `meta.json`; raise TypeError if they do not fit it."""
-    return stored_step.config(NETWORKS[name][0], values)
-
-
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
     """Return the folder of a run, or of one step of it where `RUN@STEP` is given.
 
@@ -284,7 +279,7 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     if meta["network"] != network:
         raise UserError(f"checkpoint {run}: holds a {meta['network']} network, want {network}; give another run")
     try:
-        config = config_from_json(network, meta["network_config"])
+        config = stored_step.config(NETWORKS[network][0], meta["network_config"])
     except TypeError as error:
         raise UserError(f"checkpoint {run}: its config does not fit this version ({error}); train again") from None
     stored_step.require_room((folder / "model").resolve(), config)

@@ -1,4 +1,4 @@
-"""Which episodes of a data set are held out: one rule, for training and for exports, which sees no more than sizes."""
+"""Decide which episodes of a data set are held out, by one rule for training and exports that needs only sizes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from dipn_jax.errors import UserError
 
-MOST = 1000
+MOST_HELD_OUT = 1000
 """Number of episodes that are held out at most."""
 
 
@@ -40,7 +40,7 @@ def cut(sizes: Iterable[Float[np.ndarray, "_ _ 3"]], count: int, data: pathlib.P
     Raises:
       UserError: there are fewer than two scenes.
     """
-    wanted = count - min(MOST, max(1, count // 10))
+    wanted = count - min(MOST_HELD_OUT, max(1, count // 10))
     best, first, last = 0, 0, None
     for size in sizes:
         found = first + begins(size, before=last)

@@ -1,4 +1,4 @@
-"""The columns that the episodes of each kind have, and whether a shard has just these.
+"""The columns of each kind of episode, and a check that a shard has exactly these.
 
 They follow from the annotations of the structs: `Float[Array, "*b N 3"]` is a column of numbers, 3 for each of N slots.
 """

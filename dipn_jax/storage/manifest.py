@@ -131,14 +131,14 @@ def _read(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def listed(folder: pathlib.Path) -> dict[str, Any]:
-    """Return what the manifest lists; nothing where generation has begun and no manifest is written yet."""
+    """Return what the manifest lists; nothing if generation has begun and no manifest is written yet."""
     if not (folder / MANIFEST).exists() and (folder / "config.json").is_file():
         return {}
     return dict(_read(folder)["shards"])
 
 
 def unlisted(folder: pathlib.Path, known: Mapping[str, Any]) -> list[pathlib.Path]:
-    """Return the shards that are there and not listed: of a generation that goes on, or was killed."""
+    """Return the shards that the manifest does not list, from a generation that is still running or was killed."""
     return [path for path in shards.shard_files(folder) if path.name not in known]
 
 

@@ -1,4 +1,4 @@
-"""Copies of data sets in object storage, in the user's cache: what reads a data set reads the copy."""
+"""Copies of data sets from object storage in the user's cache, from which they are read."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _known(folder: pathlib.Path) -> dict[str, Found]:
 
 @contextlib.contextmanager
 def _turn(folder: pathlib.Path) -> Iterator[None]:
-    """Wait until no other process brings the copy up to date, where files can be locked."""
+    """Wait until no other process updates the copy, if files can be locked."""
     with (folder / ".lock").open("wb") as lock:
         with contextlib.suppress(OSError):
             if fcntl is not None:

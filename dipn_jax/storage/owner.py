@@ -1,4 +1,4 @@
-"""One owner at a time for the folder of a run or an evaluation: who has it stands in `OUT/owner.json` meanwhile."""
+"""Only one process at a time may use a run's or an evaluation's folder; `OUT/owner.json` names it."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _exclusive(path: pathlib.Path) -> tuple[int, pathlib.Path]:
 
 
 def _read(path: pathlib.Path) -> dict[str, object]:
-    """Return what stands in the file; nothing if it is damaged or gone."""
+    """Return the content of the file; nothing if it is damaged or gone."""
     try:
         found = typed.parse(path.read_bytes())
     except (OSError, typed.Misfit):

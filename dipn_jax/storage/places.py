@@ -1,7 +1,7 @@
-"""Where a data set is written: a folder, or object storage, where a shard is there once somebody has created it.
+"""Where a data set is written: a folder, or object storage.
 
-Shards are written to a folder in either case. In object storage that folder is a temporary one of this process, each
-shard is then created, which one writer wins, and nothing else is locked or renamed.
+Shards are written to a folder in either case. For object storage that folder is a temporary one of this process; each
+shard is then created in the bucket, which succeeds for one writer only, and nothing is locked or renamed.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from dipn_jax.storage import accounting, manifest, mirror, records, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.storage.objects import Bucket
 
-CONFIG = mirror.CONFIG
-FEW = 20
-"""Shards that are looked at without a progress line."""
+SILENT_SHARDS = 20
+"""Number of shards below which no progress is shown while they are looked at."""
 Claim = Callable[[pathlib.Path], None]
 """Writes the configuration of a data set to its folder, or raises UserError if another one is there."""
 
@@ -32,7 +31,7 @@ class Place(Protocol):
     folder: pathlib.Path  # in which shards are written
 
     def begun(self) -> bool:
-        """Return whether there is a configuration."""
+        """Return whether the data set has a configuration."""
 
     def claim(self, claim: Claim) -> None:
         """Let `claim` write the configuration, or compare it with the one that is there."""
@@ -50,7 +49,7 @@ class Place(Protocol):
         """Take shards out of the manifest that are about to be made."""
 
     def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
-        """Take in the shard that has been written to the folder; return the entry of the one that is now there."""
+        """Add a written shard and return its manifest entry, or that of another worker who was first."""
 
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
         """Write the manifest, with the entries of the shards that were made by their names, and return it."""
@@ -64,7 +63,7 @@ class Folder:
         self.name, self.folder = str(folder), folder
 
     def begun(self) -> bool:
-        return (self.folder / CONFIG).exists()
+        return (self.folder / mirror.CONFIG).exists()
 
     def claim(self, claim: Claim) -> None:
         claim(self.folder)
@@ -98,20 +97,20 @@ class Objects:
         self._entries: dict[str, Any] = {}  # of shards that are there, by name
 
     def begun(self) -> bool:
-        return self._bucket.get(CONFIG) is not None
+        return self._bucket.get(mirror.CONFIG) is not None
 
     def claim(self, claim: Claim) -> None:
-        """As `Place.claim`. Of two that begin at the same time, the second compares with what the first has written."""
-        path = self.folder / CONFIG
+        """See `Place.claim`. If two begin at the same time, the second compares its configuration with the first."""
+        path = self.folder / mirror.CONFIG
         while True:
-            there = self._fetched(CONFIG)
+            there = self._fetched(mirror.CONFIG)
             claim(self.folder)
             mine = path.read_bytes()
             if there:
                 if mine != there:  # more episodes are asked for
-                    self._bucket.put(CONFIG, mine)
+                    self._bucket.put(mirror.CONFIG, mine)
                 return
-            if self._bucket.create(CONFIG, mine):
+            if self._bucket.create(mirror.CONFIG, mine):
                 return
 
     def note(self, command: Sequence[str], *, of: int) -> None:
@@ -128,7 +127,7 @@ class Objects:
         }
         todo = [name for name in names.values() if name not in self._entries]
         with (
-            console.Progress("look", len(todo), unit="shards", quiet=len(todo) < FEW) as progress,
+            console.Progress("look", len(todo), unit="shards", quiet=len(todo) < SILENT_SHARDS) as progress,
             concurrent.futures.ThreadPoolExecutor(mirror.AT_ONCE) as pool,
         ):
             for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
@@ -149,7 +148,7 @@ class Objects:
             self._write({name: entry for name, entry in listed.items() if name not in names})
 
     def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
-        """As `Place.commit`; where another writer was first, it is his entry, unless his shard is a shorter one."""
+        """See `Place.commit`; a shard that another writer made first stays, unless its length differs."""
         name = _name(index)
         data = (self.folder / name).read_bytes()
         try:

@@ -1,4 +1,4 @@
-"""What Orbax prints about a save that fails, beside the error that it raises."""
+"""Silence what Orbax prints about a save that fails; the error that it raises says enough."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from dipn_jax.storage import accounting, manifest, mirror, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 
-MANY = 100
-"""Shards that take so long to read that it is shown how far that is."""
+PROGRESS_SHARDS = 100
+"""Number of shards from which on progress is shown while they are read."""
 
 
 def _problem(path: pathlib.Path, entry: dict[str, Any]) -> str:
@@ -193,7 +193,7 @@ def _joined(counts: dict[pathlib.Path, int], *, kind: str) -> Any:
             leaf[end - counts[path] : end] = read
         progress.advance(1)
 
-    progress = console.Progress(f"read {kind}", len(counts), unit="shards", quiet=len(counts) < MANY)
+    progress = console.Progress(f"read {kind}", len(counts), unit="shards", quiet=len(counts) < PROGRESS_SHARDS)
     with progress, concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool:
         list(pool.map(put, counts, ends))
     return whole

@@ -1,4 +1,4 @@
-"""What is read of a checkpoint's step: its metadata, a network's config from there, and stored arrays."""
+"""Read a step of a checkpoint: its metadata, the network's config in it, and stored arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights in one file of the safetensors format, for programs that have no JAX. Nothing here reads it again."""
+"""Write weights to one file of the safetensors format, for programs without JAX. This package does not read it."""
 
 from __future__ import annotations
 

@@ -107,10 +107,17 @@ def _moments() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return volume, mean, variance
 
 
-UNIT_VOLUME, UNIT_CENTER_OF_MASS, UNIT_VARIANCE = _moments()
-"""Volume [C], centre of mass [C, 3] from the middle of the bounding box, variance about it [C, 3]."""
-_RINGS, CORNERS_USED = _rings()
-UNIT_VERTICES = _RINGS - UNIT_CENTER_OF_MASS[:, None, None] * (CORNERS_USED > 0)[..., None, None]
+_MOMENTS = _moments()
+UNIT_VOLUME = _MOMENTS[0]
+"""Volume of shapes of size 1: [C]."""
+UNIT_CENTER_OF_MASS = _MOMENTS[1]
+"""Centre of mass of shapes of size 1, from the middle of the bounding box: [C, 3]."""
+UNIT_VARIANCE = _MOMENTS[2]
+"""Variance of shapes of size 1 about their centre of mass: [C, 3]."""
+_RINGS = _rings()
+CORNERS_USED = _RINGS[1]
+"""Number of distinct corners of the section of every part: [C, P]; 0 where there is no such part."""
+UNIT_VERTICES = _RINGS[0] - UNIT_CENTER_OF_MASS[:, None, None] * (CORNERS_USED > 0)[..., None, None]
 """Corners of every part, from the centre of mass, of shapes of size 1: [C, P, 2K, 3]."""
 AXIS = np.array([_SECTIONS[name][0] for name in CLASSES], np.int32)
 """Extrusion axis of each class: 0, 1, 2 for x, y, z."""

@@ -11,7 +11,6 @@ from dipn_jax import command_words
 from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName, MethodName
 
-from .. import shares
 from ..shares import WHOLE, Share
 from . import evaluation
 from .camera import DEFAULT_CAMERA, Camera
@@ -111,5 +110,5 @@ def clear(
         longest=longest,
         remember=remember,
         share=share,
-        command=command_words.words(clear, asked, without=shares.OWN),
+        command=command_words.words(clear, asked, without=command_words.WORKER_OPTIONS),
     )

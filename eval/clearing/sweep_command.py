@@ -97,7 +97,7 @@ def sweep(
     if launch.spreads:
         spread.spread("sweep", asked, kept)
         return
-    command = command_words.words(sweep, asked, without=shares.OWN)
+    command = command_words.words(sweep, asked, without=command_words.WORKER_OPTIONS)
     with owner.owned(out):
         if shares.made(out, "sweep", share, kept):
             return

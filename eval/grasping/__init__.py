@@ -1,0 +1,1 @@
+"""Evaluations of single grasps and of GN's scores."""

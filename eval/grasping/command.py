@@ -113,7 +113,7 @@ def grasp(
                     "grasp",
                     share,
                     total=scenes_,
-                    command=command_words.words(grasp, asked, without=shares.OWN),
+                    command=command_words.words(grasp, asked, without=command_words.WORKER_OPTIONS),
                     given=settings,
                     partial=partial,
                     names=[*names, merging.TRIED],

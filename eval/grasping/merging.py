@@ -70,7 +70,7 @@ def finish(
     others: int,
     online: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """Draw what all tables tell, and return the metrics.
+    """Draw the figure of all tables, and return the metrics.
 
     Args:
       out: folder of the results.

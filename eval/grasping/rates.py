@@ -1,4 +1,4 @@
-"""Rates of grasps that were tried, and whether a score means what it says."""
+"""Success rates of grasps that were tried, and the calibration of their scores."""
 
 from __future__ import annotations
 
@@ -41,8 +41,9 @@ BINS = 10
 
 
 def rates(found: Arrays, tables: Sequence[Outcome] | Sequence[Instance], *, others: int) -> dict[str, Any]:
-    """Return flat metrics of what was tried on all tables: success with bootstrap 95 % intervals over tables, and
-    calibration.
+    """Return flat metrics of what was tried on all tables: success and calibration.
+
+    Success has bootstrap 95 % intervals over tables.
 
     Args:
       found: as `tried` returns it.

@@ -1,4 +1,4 @@
-"""How often does the best-scored grasp hold, until tables are empty? What is tried; `rates` counts it."""
+"""Try the best-scored grasp until tables are empty; `rates` counts how often it holds."""
 
 from __future__ import annotations
 

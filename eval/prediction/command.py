@@ -50,7 +50,7 @@ def predict(
       seed: random seed of scenes and pushes, which are never those of training data.
       engine: the engine whose result counts as the truth.
       threads: threads of the native engine; one per core by default.
-      physics: also measure the engine itself with nominal mass and friction, the privileged ceiling.
+      physics: also measure the engine itself with nominal mass and friction, the best case.
       segmented: also measure with masks found in the image by colour and height, not taken from the simulator.
       ranges: the ranges that random objects are drawn from.
       share: which part of the pushes this worker makes, for dipn-eval merge; they are shared in groups of 64.
@@ -99,7 +99,7 @@ def predict(
             "prediction",
             share,
             total=push_errors.groups(scenes_),
-            command=command_words.words(predict, asked, without=shares.OWN),
+            command=command_words.words(predict, asked, without=command_words.WORKER_OPTIONS),
             given=settings,
             partial=partial,
             names=merging.save(out, rows, films),

@@ -18,8 +18,10 @@ from ..shares import PART, Part
 from . import push_errors
 from .push_errors import DISTANCES
 
-ERRORS, FILMS = "errors.npz", "films.npz"
-"""Names of the files with the errors of every push, and with pictures of some."""
+ERRORS = "errors.npz"
+"""Name of the file with the errors of every push."""
+FILMS = "films.npz"
+"""Name of the file with pictures of some pushes."""
 
 
 def save(out: pathlib.Path, rows: Mapping[str, np.ndarray], films: Mapping[str, np.ndarray]) -> list[str]:

@@ -35,10 +35,10 @@ def test_modules_and_their_tests_exist() -> None:
     assert set(wanted) <= {pathlib.Path(module).stem for module in mutants.TESTS}
 
 
-def test_the_table_in_docs_is_that_of_the_kept_numbers() -> None:
+def test_the_section_in_docs_is_that_of_the_kept_numbers() -> None:
     text, values = (ROOT / "docs" / "testing.md").read_text(), _kept()
     assert set(values) <= set(mutants.TESTS)
-    assert pages.with_table(text, mutants.table(values)) == text
+    assert pages.with_tables(text, mutants.section(values)) == text
     for found in values.values():
         assert found["mutants"] == found["killed"] + len(found["survivors"])
 
@@ -70,11 +70,13 @@ def test_a_dry_run_shows_the_tests_of_a_module(tmp_path: pathlib.Path, capsys: p
     assert "eval/nothing.py" in capsys.readouterr().err
 
 
-def test_the_table_of_known_numbers() -> None:
+def test_the_table_has_the_measured_modules_and_a_sentence_the_others() -> None:
     found = {"mutants": 8, "killed": 7, "survivors": [{"became": "x"}]}
-    rows = mutants.table({"train/split.py": found}).splitlines()
-    assert "| `train/split.py` | 8 | 7 (87.5 %) | 1 |" in rows
-    assert sum("| not run |" in row for row in rows) == len(mutants.TESTS) - 1
+    table, _, others = mutants.section({"train/split.py": found}).partition("\n\n")
+    assert table.splitlines()[2:] == ["| `train/split.py` | 8 | 7 (87.5 %) | 1 |"]
+    assert others.startswith("Not measured yet: `eval/metrics.py`, ") and "train/split.py" not in others
+    assert others.count("`") == 2 * (len(mutants.TESTS) - 1) and max(map(len, others.splitlines())) <= 120
+    assert "Not measured" not in mutants.section(dict.fromkeys(mutants.TESTS, found))
 
 
 def test_annotations_are_found_and_nothing_else() -> None:

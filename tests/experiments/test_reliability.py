@@ -34,7 +34,7 @@ def test_every_test_that_the_page_names_exists() -> None:
         assert name in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)], f"{file}::{name}"
 
 
-def test_the_tables_in_docs_are_those_of_the_kept_counts() -> None:
+def test_the_section_in_docs_is_that_of_the_kept_counts() -> None:
     text = (ROOT / "docs" / "reliability.md").read_text()
     assert pages.with_tables(text, reliability.section(_kept())) == text
 
@@ -44,7 +44,16 @@ def test_the_counts_of_all_commands_are_added() -> None:
     said = "7 faults: 1 records lost, 2 repeated, 1 results wrong, 0 files damaged, 0 tracebacks"
     assert said in text and "1,500 inputs: 1 tracebacks" in text
     assert "8 damaged: 7 runs went on" in text and "| clear | killed | 4 | 0 | 2 | 0 | 0 | 0 |" in text
-    assert reliability.section({}).count("not run") == 3
+    assert reliability.section({}).count("Tried: not run.") == 3
+
+
+def test_every_promise_is_a_paragraph_of_short_lines() -> None:
+    lines = reliability.section(VALUES).splitlines()
+    assert max(map(len, lines)) <= 120
+    paragraphs = "\n".join(lines).split("\n\n")
+    held = [each for each in paragraphs if " ".join(each.split()).startswith("Held by `tests/")]
+    assert len(held) == len(reliability.PROMISES) == sum(each.startswith("**") for each in paragraphs)
+    assert sum(each.count("`") for each in held) == 2 * sum(len(each.tests) for each in reliability.PROMISES)
 
 
 def test_what_an_experiment_found_is_put_beside_what_others_found(tmp_path: pathlib.Path) -> None:

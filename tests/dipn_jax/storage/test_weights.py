@@ -20,7 +20,7 @@ from dipn_jax.networks import push_frame
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
-from dipn_jax.storage import checkpoint, weights
+from dipn_jax.storage import checkpoint, stored_step, weights
 
 SHORT = (1, 1, 1, 1)
 CONFIGS = {
@@ -78,7 +78,7 @@ def test_a_file_holds_every_array_and_says_what_goes_in_and_out(kind: str, tmp_p
     assert about["network"] == network and about["step"] == "7" and about["format"] == weights.FORMAT
     assert about["weights_sha256"] == checkpoint.digest(model) and "HWIO" in about["layout"]
     assert about["run_sha256"] == checkpoint.used(tmp_path / "run")["digest"]  # type: ignore[index]
-    assert checkpoint.config_from_json(network, json.loads(about["config"])) == config
+    assert stored_step.config(checkpoint.NETWORKS[network][0], json.loads(about["config"])) == config
     sizes = {"B": 1, "H": 64, "W": 32, "N": 3, "K": 2}
     shapes = {
         end: {name: [sizes.get(side, side) for side in one["shape"]] for name, one in json.loads(about[end]).items()}
