@@ -20,6 +20,9 @@ from typing import Any
 from dipn_jax import addresses, typed
 from dipn_jax.errors import UserError
 
+EMPTY = "'': an empty path, as of a variable that is not set; give a path, or . for this folder"
+"""What is said of an empty path."""
+
 
 def package_versions() -> dict[str, str]:
     """Return the versions of the packages that results depend on."""
@@ -51,14 +54,26 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
     """Return a path that a user gave with `~` expanded, and absolute; links in it stay.
 
     Raises:
-      UserError: there is no such home folder, or it is a URL.
+      UserError: it is empty, there is no such home folder, or it is a URL.
     """
+    path = not_empty(path)
     if address := addresses.url(path):
         raise UserError(f"{address}: a URL, which this option does not take; give a path")
     try:
-        return pathlib.Path(path).expanduser().absolute()
+        return path.expanduser().absolute()
     except RuntimeError:
         raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
+
+
+def not_empty(path: pathlib.Path | str) -> pathlib.Path:
+    """Return a path that a user gave; an empty text, which `pathlib` takes for the folder that we are in, is refused.
+
+    Raises:
+      UserError: it is an empty text.
+    """
+    if path == "":
+        raise UserError(EMPTY)
+    return pathlib.Path(path)
 
 
 def with_absolute_paths(value: Any, *, urls: bool = False) -> Any:

@@ -268,7 +268,7 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
       UserError: no run there, no whole step in it, or it holds another network.
     """
     forking.check()
-    run = find(pathlib.Path(run), network=network)
+    run = find(files.not_empty(run), network=network)
     if not run.is_dir():
         raise UserError(f"checkpoint {run}: no such folder; {WANTED}")
     found = newest(run)
