@@ -13,6 +13,7 @@ import os
 import pathlib
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -46,7 +47,7 @@ def code_digest(*folders: pathlib.Path) -> str:
     digest = hashlib.sha256(str(package_versions()).encode())
     for folder in (pathlib.Path(__file__).parent, *folders):
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.h")]):
-            digest.update(path.read_bytes())
+            digest.update(read_bytes(path))
     return digest.hexdigest()
 
 
@@ -104,6 +105,7 @@ def cache() -> pathlib.Path | None:
 
 def file_sha256(path: pathlib.Path) -> str:
     """Return the SHA-256 of a file's bytes, in hex."""
+    require_regular(path)
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(1 << 20):
@@ -157,8 +159,25 @@ def _sync(path: pathlib.Path) -> None:
         os.close(descriptor)
 
 
+def require_regular(path: pathlib.Path) -> None:
+    """Raise an OSError where a file is a pipe, a socket or a device, which could be read for ever, or not there.
+
+    A folder passes; who reads it gets the system's own error.
+    """
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+
+
+def read_bytes(path: pathlib.Path) -> bytes:
+    """Return what a regular file holds."""
+    require_regular(path)
+    return path.read_bytes()
+
+
 def read_text(path: pathlib.Path) -> str:
     """Return a text file's content: UTF-8, with or without a byte-order mark, whatever the locale says."""
+    require_regular(path)
     return path.read_text(encoding="utf-8-sig")
 
 
@@ -204,7 +223,7 @@ def read_json(path: pathlib.Path, *, wanted: typed.Form = dict) -> Any:
       UserError: it is missing, is not JSON, or does not have the form `wanted`.
     """
     try:
-        return typed.check(typed.parse(path.read_bytes()), wanted)
+        return typed.check(typed.parse(read_bytes(path)), wanted)
     except FileNotFoundError:
         raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
     except OSError as error:

@@ -165,6 +165,14 @@ def test_text_files_are_read_and_written_as_utf8() -> None:
                     assert named or any("b" in mode for mode in modes), f"{path}: {called}"
 
 
+def test_bytes_are_read_in_one_place() -> None:
+    """`files.read_bytes` refuses what is no regular file, such as a pipe, which could be read for ever."""
+    allowed = {ROOT / "dipn_jax" / "files.py", ROOT / "dipn_jax" / "storage" / "owner.py"}
+    for package in PACKAGES:
+        for path in {*(ROOT / package).rglob("*.py")} - allowed:
+            assert not [name for name, _ in _calls(path) if re.search(r"(?<!^files)\.read_bytes$", name)], path
+
+
 def test_nothing_is_pickled() -> None:
     """Unpickling would run what is in a file; every call of NumPy that could do so has `allow_pickle=False`."""
     forbidden = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
