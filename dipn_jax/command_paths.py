@@ -1,10 +1,11 @@
-"""The paths on a command line: absolute when a command begins, and none of them empty."""
+"""The paths on a command line: absolute when a command begins, none of them empty, and files of the right kind."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import itertools
+import os
 import pathlib
 import typing
 from collections.abc import Callable, Sequence
@@ -28,6 +29,24 @@ def absolute(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(**options)
 
     return called
+
+
+def require_file(path: pathlib.Path, *suffixes: str, option: str) -> None:
+    """Raise a UserError if an option cannot name a file to write; creates nothing.
+
+    Args:
+      path: the file.
+      suffixes: how its name may end, so that no file of another kind is written over by mistake.
+      option: name of the option.
+    """
+    given = f"--{option} {path}"
+    if path.is_dir():
+        raise UserError(f"{given}: a folder; give the name of a file, such as {path / f'{path.name}{suffixes[0]}'}")
+    if path.suffix.lower() not in suffixes:
+        raise UserError(f"{given}: want a file whose name ends in {' or '.join(suffixes)}")
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise UserError(f"{given}: no file can be written in {folder}; give another folder")
 
 
 def registry(arguments: Sequence[str]) -> constructors.ConstructorRegistry:

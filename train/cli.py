@@ -214,7 +214,7 @@ def export(
 
     Args:
       run: run folder, or builtin.
-      out: new run folder, or the file.
+      out: new run folder, or the file, NAME.safetensors.
       network: the kind of network in it; vpg for a run of baseline, whatever its method.
       format_: run, or safetensors.
     """
