@@ -7,7 +7,7 @@ import pathlib
 
 import tyro
 
-from dipn_jax import addresses, console
+from dipn_jax import addresses, command_paths, console
 from dipn_jax.addresses import Place
 from dipn_jax.errors import UserError
 
@@ -70,7 +70,7 @@ def info(
 
     Args:
       folder: a data set, or its URL.
-      html: file of the page, which needs no other.
+      html: file of the page, NAME.html, which needs no other.
       sample: episodes on the page, drawn at random.
       seed: of that draw.
     """
@@ -78,13 +78,13 @@ def info(
 
     console.require_between(1, MOST_SHOWN, sample=sample)
     console.require_seed(seed)
+    if html is not None:
+        command_paths.require_file(html, ".html", ".htm", option="html")
     folder = mirror.local(folder)
     summary = records.summary(folder)
     if html is not None:
         from . import browsing
 
-        if html.is_dir():
-            raise UserError(f"--html {html}: is a folder; give the name of a file")
         browsing.write(folder, html, sample=sample, seed=seed)
     console.say(json.dumps(summary, indent=1))
     mixed = accounting.mixed(summary["made_by"])

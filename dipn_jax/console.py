@@ -6,7 +6,6 @@ The only module of the library that prints. Importing it imports no JAX, so that
 from __future__ import annotations
 
 import codecs
-import functools
 import inspect
 import io
 import itertools
@@ -17,14 +16,13 @@ import signal
 import sys
 import threading
 import time
-import typing
 from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from dipn_jax import addresses, files
+from dipn_jax import addresses, command_paths, files
 from dipn_jax.errors import UserError
 from dipn_jax.interruption import stops
 
@@ -173,20 +171,6 @@ def _option(name: str) -> str:
     return f"--{name.rstrip('_').replace('_', '-')}"
 
 
-def _with_paths(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `command` with the paths among its arguments made absolute before it begins."""
-
-    @functools.wraps(command)
-    def called(*positional: Any, **named: Any) -> Any:
-        hints = typing.get_type_hints(inspect.unwrap(command), include_extras=True)
-        options = inspect.signature(command).bind(*positional, **named).arguments
-        for name, value in options.items():
-            options[name] = files.with_absolute_paths(value, urls=addresses.taken(hints.get(name)))
-        return command(**options)
-
-    return called
-
-
 def _described(command: Callable[..., Any], *, whole: bool) -> str:
     """Return the text of a command's help: the first sentence of its docstring, or everything before `Args:`.
 
@@ -282,7 +266,9 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
         Annotated[
             Any,
             tyro.conf.subcommand(
-                name, constructor=_with_paths(command), description=_described(command, whole=name in arguments[:1])
+                name,
+                constructor=command_paths.absolute(command),
+                description=_described(command, whole=name in arguments[:1]),
             ),
         ]
         for name, command in commands.items()
@@ -290,5 +276,6 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
     one_of_them: Any = Union[choices]  # noqa: UP007  a tuple
     program = pathlib.Path(sys.argv[0]).name
     options = (tyro.conf.OmitArgPrefixes,)
-    code: int | None = tyro.cli(one_of_them, prog=program, description=description, args=arguments, config=options)
+    with command_paths.registry(arguments):
+        code: int | None = tyro.cli(one_of_them, prog=program, description=description, args=arguments, config=options)
     return code

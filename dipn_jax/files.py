@@ -13,12 +13,16 @@ import os
 import pathlib
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator
 from typing import Any
 
 from dipn_jax import addresses, typed
 from dipn_jax.errors import UserError
+
+EMPTY = "'': an empty path, as of a variable that is not set; give a path, or . for this folder"
+"""What is said of an empty path."""
 
 
 def package_versions() -> dict[str, str]:
@@ -43,7 +47,7 @@ def code_digest(*folders: pathlib.Path) -> str:
     digest = hashlib.sha256(str(package_versions()).encode())
     for folder in (pathlib.Path(__file__).parent, *folders):
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.h")]):
-            digest.update(path.read_bytes())
+            digest.update(read_bytes(path))
     return digest.hexdigest()
 
 
@@ -51,12 +55,13 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
     """Return a path that a user gave with `~` expanded, and absolute; links in it stay.
 
     Raises:
-      UserError: there is no such home folder, it is a URL, or a link that leads back to itself.
+      UserError: it is empty, there is no such home folder, it is a URL, or a link that leads back to itself.
     """
+    path = not_empty(path)
     if address := addresses.url(path):
         raise UserError(f"{address}: a URL, which this option does not take; give a path")
     try:
-        found = pathlib.Path(path).expanduser().absolute()
+        found = path.expanduser().absolute()
     except RuntimeError:
         raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
     try:
@@ -65,6 +70,17 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
         if error.errno == errno.ELOOP:
             raise UserError(f"{path}: a link that leads back to itself; delete it, or give another path") from None
     return found
+
+
+def not_empty(path: pathlib.Path | str) -> pathlib.Path:
+    """Return a path that a user gave; an empty text, which `pathlib` takes for the folder that we are in, is refused.
+
+    Raises:
+      UserError: it is an empty text.
+    """
+    if path == "":
+        raise UserError(EMPTY)
+    return pathlib.Path(path)
 
 
 def with_absolute_paths(value: Any, *, urls: bool = False) -> Any:
@@ -95,6 +111,7 @@ def cache() -> pathlib.Path | None:
 
 def file_sha256(path: pathlib.Path) -> str:
     """Return the SHA-256 of a file's bytes, in hex."""
+    require_regular(path)
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(1 << 20):
@@ -149,8 +166,25 @@ def _sync(path: pathlib.Path) -> None:
         os.close(descriptor)
 
 
+def require_regular(path: pathlib.Path) -> None:
+    """Raise an OSError where a file is a pipe, a socket or a device, which could be read for ever, or not there.
+
+    A folder passes; who reads it gets the system's own error.
+    """
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+
+
+def read_bytes(path: pathlib.Path) -> bytes:
+    """Return what a regular file holds."""
+    require_regular(path)
+    return path.read_bytes()
+
+
 def read_text(path: pathlib.Path) -> str:
     """Return a text file's content: UTF-8, with or without a byte-order mark, whatever the locale says."""
+    require_regular(path)
     return path.read_text(encoding="utf-8-sig")
 
 
@@ -196,7 +230,7 @@ def read_json(path: pathlib.Path, *, wanted: typed.Form = dict) -> Any:
       UserError: it is missing, is not JSON, or does not have the form `wanted`.
     """
     try:
-        return typed.check(typed.parse(path.read_bytes()), wanted)
+        return typed.check(typed.parse(read_bytes(path)), wanted)
     except FileNotFoundError:
         raise UserError(f"{path}: not found; give a folder that the command before this one wrote") from None
     except OSError as error:

@@ -21,9 +21,9 @@ MOST_LINES = 300
 """Largest number of lines in a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "names", "command_words", "seeds", "typed", "interruption", "forking", "addresses", "files", "console",
-    "pages", "machine", "launch", "structs", "workspace", "geometry", "batching", "engine", "world", "physics", "sight",
-    "networks", "storage", "planning",
+    "errors", "names", "command_words", "seeds", "typed", "interruption", "forking", "addresses", "files",
+    "command_paths", "console", "pages", "machine", "launch", "structs", "workspace", "geometry", "batching", "engine",
+    "world", "physics", "sight", "networks", "storage", "planning",
 ]  # fmt: skip
 
 
@@ -170,6 +170,14 @@ def test_text_files_are_read_and_written_as_utf8() -> None:
                     modes = [str(arg.value) for arg in call.args if isinstance(arg, ast.Constant)]
                     named = any(keyword.arg == "encoding" for keyword in call.keywords)
                     assert named or any("b" in mode for mode in modes), f"{path}: {called}"
+
+
+def test_bytes_are_read_in_one_place() -> None:
+    """`files.read_bytes` refuses what is no regular file, such as a pipe, which could be read for ever."""
+    allowed = {ROOT / "dipn_jax" / "files.py", ROOT / "dipn_jax" / "storage" / "owner.py"}
+    for package in PACKAGES:
+        for path in {*(ROOT / package).rglob("*.py")} - allowed:
+            assert not [name for name, _ in _calls(path) if re.search(r"(?<!^files)\.read_bytes$", name)], path
 
 
 def test_nothing_is_pickled() -> None:

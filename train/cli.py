@@ -15,7 +15,7 @@ from dipn_jax import console
 from dipn_jax.addresses import Place
 
 from .acting_commands import baseline, grasp_online, say
-from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig
+from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig, check
 from .sweep_command import sweep
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from .example_store import Room
     from .loop import Task
+    from .split import Folders
 
 PUSH = TrainConfig(steps=1500, learning_rate=3e-3, eval_every=250, save_every=250)
 """How `push` trains unless told otherwise."""
@@ -44,9 +45,10 @@ def _fit(
         say(out, result, digits=".4g")
 
 
-def _join(compute: Compute) -> None:
-    """Join the other processes of the job, before JAX is used."""
-    if compute.data_parallel or compute.coordinator or compute.processes != 1:
+def _begin(data: Folders, config: TrainConfig, out: pathlib.Path, compute: Compute) -> None:
+    """Check the options, before any data is read, and join the other processes of the job, before JAX is used."""
+    check(config, compute, out, data_sets=1 if isinstance(data, pathlib.Path) else len(data))
+    if compute.data_parallel:
         from . import devices
 
         devices.join(compute)
@@ -59,7 +61,6 @@ def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
 
     from .example_store import Room
 
-    console.require_between(0, 1e6, memory=compute.memory)
     if compute.compile_only:
         with tempfile.TemporaryDirectory() as folder:
             yield Room(0, pathlib.Path(folder) / "examples")
@@ -67,7 +68,7 @@ def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
         yield Room(compute.memory, out / "examples" / str(jax.process_index()))
 
 
-def _local(data: pathlib.Path | tuple[pathlib.Path, ...]) -> tuple[pathlib.Path, ...]:
+def _local(data: Folders) -> tuple[pathlib.Path, ...]:
     """Return the folders of one data set or several: those given, and copies of what is at URLs."""
     from dipn_jax.storage import mirror
 
@@ -114,7 +115,7 @@ def push(
       config: optimizer and schedule.
       compute: how steps are computed.
     """
-    _join(compute)
+    _begin(data, config, out, compute)
     from dipn_jax.networks.dipn import DipnConfig
 
     from .push import PushTask
@@ -150,7 +151,7 @@ def grasp_pretrain(
       config: optimizer and schedule; an example is a view.
       compute: how steps are computed.
     """
-    _join(compute)
+    _begin(data, config, out, compute)
     from dipn_jax.networks.grasp import GraspConfig
 
     from .grasp import PretrainTask
@@ -183,7 +184,7 @@ def grasp(
       config: optimizer and schedule; an example is a grasp.
       compute: how steps are computed.
     """
-    _join(compute)
+    _begin(data, config, out, compute)
     from dipn_jax.networks.grasp import GraspConfig
 
     from .grasp import GraspTask
@@ -213,7 +214,7 @@ def export(
 
     Args:
       run: run folder, or builtin.
-      out: new run folder, or the file.
+      out: new run folder, or the file, NAME.safetensors.
       network: the kind of network in it; vpg for a run of baseline, whatever its method.
       format_: run, or safetensors.
     """

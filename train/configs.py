@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import re
 from typing import Literal
 
 import tyro
+
+from dipn_jax import console
+from dipn_jax.errors import UserError
 
 Preset = Literal["compact", "paper"]
 """Architecture of a network: ours, or as published."""
@@ -14,6 +18,9 @@ ShapeClass = Literal["cuboid", "cylinder", "half_cylinder", "triangular_prism", 
 """A class of shapes, as in `shapes.CLASSES`."""
 LearnerName = Literal["vpg", "rea", "dqn"]
 """A compared method that learns while it acts."""
+LAST_PORT = 65_535
+"""The highest number of a port."""
+_ADDRESS = re.compile(r"(?:\[[0-9A-Fa-f:.%]+\]|[\w.-]+):(?P<port>[0-9]{1,5})", re.ASCII)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +47,19 @@ class TrainConfig:
     """Steps between points of the learning curve."""
     save_every: int = 200
     """Steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        console.require_positive(
+            steps=self.steps,
+            batch=self.batch,
+            learning_rate=self.learning_rate,
+            eval_every=self.eval_every,
+            save_every=self.save_every,
+        )
+        console.require_between(0, 1, weight_decay=self.weight_decay)
+        console.require_seed(self.seed)
+        for weight in self.mix:
+            console.require_positive(mix=weight)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,9 +90,54 @@ class Compute:
     process: int = 0
     """Which of them this one is, counted from 0, with --coordinator."""
 
+    def __post_init__(self) -> None:
+        console.require_positive(accumulate=self.accumulate)
+        console.require_between(0, 1e6, memory=self.memory)
+        given = f"--processes {self.processes} --process {self.process}"
+        if not self.coordinator:
+            if (self.processes, self.process) != (1, 0):
+                raise UserError(f"{given}: needs --coordinator HOST:PORT, the address of process 0")
+            return
+        parts = _ADDRESS.fullmatch(self.coordinator)
+        if not (parts and 1 <= int(parts["port"]) <= LAST_PORT):
+            raise UserError(
+                f"--coordinator {self.coordinator}: want HOST:PORT, the address of process 0 and a free port of it, 1 "
+                f"to {LAST_PORT}"
+            )
+        if not 0 <= self.process < self.processes:
+            raise UserError(f"{given}: want the number of processes, and which of them this one is, counted from 0")
+        if not self.data_parallel:
+            raise UserError(f"--coordinator {self.coordinator}: needs --data-parallel, by which processes share a run")
+
 
 DEFAULT_COMPUTE = Compute()
 """One device, whole batches, single precision."""
+
+
+def check(config: TrainConfig, compute: Compute, out: pathlib.Path, *, data_sets: int) -> None:
+    """Raise a UserError where options do not fit one another, or `out` cannot be written to.
+
+    Each option by itself is checked when it is given.
+
+    Args:
+      config: how to learn.
+      compute: how steps are computed.
+      out: run folder.
+      data_sets: number of data sets to learn from.
+    """
+    if config.batch % compute.accumulate:
+        raise UserError(
+            f"--batch {config.batch} --accumulate {compute.accumulate}: want a number that divides the batch"
+        )
+    check_mix(config, data_sets=data_sets)
+    console.require_out(out)
+
+
+def check_mix(config: TrainConfig, *, data_sets: int) -> None:
+    """Raise a UserError where the mix is not one of this number of data sets."""
+    if config.mix and len(config.mix) != data_sets:
+        given = " ".join(f"{weight:g}" for weight in config.mix)
+        raise UserError(f"--mix {given}: want a number for each folder of --data, {data_sets}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import os
-from collections.abc import Sequence
+import socket
+import threading
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from dipn_jax import console, typed
 from dipn_jax.errors import UserError
 
 from .configs import Compute
 
 SYNC_EVERY = 10
 """Steps after which the processes of a job ask one another whether one of them has been interrupted."""
+PATIENCE = 300
+"""Seconds that a process waits for the others of its job."""
+SILENCE = 10
+"""Seconds after which it says that it does."""
 
 
 class OneDevice:
@@ -113,19 +121,64 @@ def join(compute: Compute) -> None:
     options do.
 
     Raises:
-      UserError: the options do not say who this process is.
+      UserError: the processes do not find one another.
     """
     if compute.coordinator:
-        if not 0 <= compute.process < compute.processes:
-            raise UserError(
-                f"--processes {compute.processes} --process {compute.process}: want the number of processes, and which "
-                "of them this one is, counted from 0"
-            )
-        jax.distributed.initialize(compute.coordinator, compute.processes, compute.process)
-    elif compute.processes != 1 or compute.process != 0:
-        raise UserError(f"--processes {compute.processes}: needs --coordinator HOST:PORT, the address of process 0")
+        given = f"--coordinator {compute.coordinator}"
+        if compute.process == 0:
+            _require_port(compute.coordinator)
+        who = compute.coordinator, compute.processes, compute.process
+        _in_time(lambda: jax.distributed.initialize(*who, initialization_timeout=2 * PATIENCE), given)
     elif _started_as_several():
-        jax.distributed.initialize()
+        _in_time(lambda: jax.distributed.initialize(initialization_timeout=2 * PATIENCE), "the job manager's processes")
+
+
+def _require_port(coordinator: str) -> None:
+    """Raise a UserError if this process cannot listen where it coordinates; JAX would end with a segmentation fault."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", int(coordinator.rpartition(":")[2])))
+        except OSError as error:
+            raise UserError(
+                f"--coordinator {coordinator}: process 0 cannot listen there ({error.strerror}); give another port"
+            ) from None
+
+
+def _in_time(meet: Callable[[], None], given: str) -> None:
+    """Call `meet`, which waits for other processes, and let it be interrupted, which JAX's own wait cannot be.
+
+    JAX would abort this process where it has waited too long, so that our patience ends before its own.
+
+    Args:
+      meet: the call.
+      given: what says who the others are, for messages.
+
+    Raises:
+      UserError: the others did not come in time, or JAX cannot find out who they are.
+    """
+    met: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+    def call() -> None:
+        try:
+            meet()
+        except Exception as error:
+            met.set_exception(error)
+        else:
+            met.set_result(None)
+
+    threading.Thread(target=call, daemon=True).start()
+    if not concurrent.futures.wait([met], timeout=SILENCE).done:
+        console.note(f"{given}: waiting for the other processes, {PATIENCE:.0f} s at most")
+        concurrent.futures.wait([met], timeout=PATIENCE - SILENCE)
+    if not met.done():
+        raise UserError(
+            f"{given}: not all processes came within {PATIENCE:.0f} s; look whether each of them was started, and can "
+            "reach process 0 there"
+        )
+    if error := met.exception():
+        said = typed.one_line(str(error) or type(error).__name__, most=200)
+        raise UserError(f"{given}: cannot join ({said}); look at host, port and the numbers of the processes") from None
 
 
 def _started_as_several() -> bool:

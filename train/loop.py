@@ -21,7 +21,7 @@ from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner, saving
 
 from . import devices, finite, log, order, precision, profiling
-from .configs import DEFAULT_COMPUTE, Compute, TrainConfig
+from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check
 from .optimizers import make_optimizer
 
 
@@ -132,7 +132,7 @@ def fit(
       UserError: the folder holds a run of another config or on other data, or another process has it; or a loss or
         a weight is not finite, after which nothing is saved.
     """
-    _check(config, compute, out)
+    check(config, compute, out, data_sets=len(task.parts))
     order.batches(task.parts, config)  # raises where the mix is wrong, before anything is made
     where = devices.placement(compute, batch=config.batch)
     optimizer = make_optimizer(config, examples=task.size)
@@ -224,25 +224,6 @@ def _compile(
     planned = step.lower(*given, batch, jax.random.key(0)).compile().memory_analysis()
     sizes = {"arguments": planned.argument_size_in_bytes, "temporary": planned.temp_size_in_bytes}
     return {f"{name}_mb": size / 1e6 for name, size in sizes.items()}
-
-
-def _check(config: TrainConfig, compute: Compute, out: pathlib.Path) -> None:
-    """Raise UserError where an option is out of its range or `out` cannot be written."""
-    console.require_positive(
-        steps=config.steps,
-        batch=config.batch,
-        learning_rate=config.learning_rate,
-        eval_every=config.eval_every,
-        save_every=config.save_every,
-        accumulate=compute.accumulate,
-    )
-    if config.batch % compute.accumulate:
-        raise UserError(
-            f"--batch {config.batch} --accumulate {compute.accumulate}: want a number that divides the batch"
-        )
-    console.require_between(0, 1, weight_decay=config.weight_decay)
-    console.require_seed(config.seed)
-    console.require_out(out)
 
 
 def _resume(out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTransformation) -> tuple[Any, int]:

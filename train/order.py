@@ -8,10 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dipn_jax import console
 from dipn_jax.errors import UserError
 
-from .configs import TrainConfig
+from .configs import TrainConfig, check_mix
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Grain remarks on a profiler when it is imported
 import grain  # noqa: E402
@@ -30,7 +29,10 @@ def batches(parts: Sequence[int], config: TrainConfig) -> Sequence[np.ndarray]:
     Raises:
       UserError: the mix is not one of these data sets.
     """
-    _check(parts, config.mix)
+    check_mix(config, data_sets=len(parts))
+    if config.mix and 0 in parts:
+        given = " ".join(f"{weight:g}" for weight in config.mix)
+        raise UserError(f"--mix {given}: --limit leaves nothing of data set {parts.index(0) + 1}; give a larger one")
     ends = list(itertools.accumulate(parts))
     begins = [0, *ends[:-1]] if config.mix else [0]
     ranges = zip(begins, ends if config.mix else ends[-1:], strict=True)
@@ -38,15 +40,3 @@ def batches(parts: Sequence[int], config: TrainConfig) -> Sequence[np.ndarray]:
     mixed = grain.MapDataset.mix(each, weights=config.mix) if config.mix else each[0]
     found: Sequence[np.ndarray] = mixed.batch(config.batch)
     return found
-
-
-def _check(parts: Sequence[int], mix: Sequence[float]) -> None:
-    if not mix:
-        return
-    given = " ".join(f"{weight:g}" for weight in mix)
-    if len(mix) != len(parts):
-        raise UserError(f"--mix {given}: want a number for each folder of --data, {len(parts)}")
-    for weight in mix:
-        console.require_positive(mix=weight)
-    if 0 in parts:
-        raise UserError(f"--mix {given}: --limit leaves nothing of data set {parts.index(0) + 1}; give a larger one")

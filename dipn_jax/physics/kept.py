@@ -40,7 +40,7 @@ def program(
     key = hashlib.sha256("\n".join(about).encode()).hexdigest()
     path = pathlib.Path(cache) / "traced" / key
     try:
-        traced = export.deserialize(bytearray(path.read_bytes()))
+        traced = export.deserialize(bytearray(files.read_bytes(path)))
     except Exception:  # not there or damaged: what a damaged one raises is not documented
         try:
             traced = export.export(jax.jit(function))(*shapes)

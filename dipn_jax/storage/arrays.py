@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dipn_jax import typed
+from dipn_jax import files, typed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,7 @@ def read(path: pathlib.Path, wanted: Mapping[str, Form]) -> dict[str, np.ndarray
       Misfit: the file is missing or damaged, or an array is missing or has not its form.
     """
     try:
+        files.require_regular(path)
         with np.load(path, allow_pickle=False) as stored:
             found = {name: stored[name] for name in wanted if name in stored.files}
     except OSError as error:

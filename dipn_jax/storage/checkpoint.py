@@ -153,7 +153,7 @@ def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
 def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
     """Return the metadata of a step folder, or None if anything in it is missing or changed."""
     try:
-        meta: dict[str, Any] = typed.check(typed.parse((folder / "meta.json").read_bytes()), stored_step.FORM)
+        meta: dict[str, Any] = typed.check(typed.parse(files.read_bytes(folder / "meta.json")), stored_step.FORM)
         stored = {typed.inside(folder, name): digest for name, digest in meta["sha256"].items()}
         good = all(files.file_sha256(path) == digest for path, digest in stored.items())
     except (OSError, typed.Misfit):
@@ -269,7 +269,7 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
       UserError: no run there, no whole step in it, or it holds another network.
     """
     forking.check()
-    run = find(pathlib.Path(run), network=network)
+    run = find(files.not_empty(run), network=network)
     if not run.is_dir():
         raise UserError(f"checkpoint {run}: no such folder; {WANTED}")
     found = newest(run)

@@ -114,7 +114,7 @@ def _read(folder: pathlib.Path) -> dict[str, Any]:
     """Return the manifest of a data set; raise UserError if it is missing or damaged."""
     path = folder / MANIFEST
     try:
-        manifest: dict[str, Any] = typed.check(typed.parse(path.read_bytes()), _FORM)
+        manifest: dict[str, Any] = typed.check(typed.parse(files.read_bytes(path)), _FORM)
         for name in manifest["shards"]:
             if "/" in name or not (name.startswith("shard-") and name.endswith(".parquet")):
                 raise typed.Misfit(f"{typed.brief(name)} is no name of a shard")

@@ -118,7 +118,7 @@ def _has(path: pathlib.Path, known: Found | None, there: Found) -> bool:
 def _known(folder: pathlib.Path) -> dict[str, Found]:
     """Return which object each file is a copy of; where that cannot be read, all are fetched again."""
     with contextlib.suppress(OSError, typed.Misfit):
-        found = typed.check(typed.parse((folder / INDEX).read_bytes()), _FORM)
+        found = typed.check(typed.parse(files.read_bytes(folder / INDEX)), _FORM)
         return {name: Found(**entry) for name, entry in found.items()}
     return {}
 

@@ -105,7 +105,7 @@ class Objects:
         while True:
             there = self._fetched(mirror.CONFIG)
             claim(self.folder)
-            mine = path.read_bytes()
+            mine = files.read_bytes(path)
             if there:
                 if mine != there:  # more episodes are asked for
                     self._bucket.put(mirror.CONFIG, mine)
@@ -115,7 +115,7 @@ class Objects:
 
     def note(self, command: Sequence[str], *, of: int) -> None:
         accounting.note(self.folder, command, of=of)
-        self._bucket.put(accounting.ASKED, (self.folder / accounting.ASKED).read_bytes())
+        self._bucket.put(accounting.ASKED, files.read_bytes(self.folder / accounting.ASKED))
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
         """As `Place.counts`: shards that the manifest does not list are fetched to be looked at."""
@@ -150,7 +150,7 @@ class Objects:
     def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
         """See `Place.commit`; a shard that another writer made first stays, unless its length differs."""
         name = _name(index)
-        data = (self.folder / name).read_bytes()
+        data = files.read_bytes(self.folder / name)
         try:
             while not self._bucket.create(name, data):
                 theirs = self._looked_at(name)
@@ -194,7 +194,7 @@ class Objects:
 
     def _write(self, entries: dict[str, Any]) -> dict[str, Any]:
         found = manifest.write(self.folder, entries)
-        self._bucket.put(MANIFEST, (self.folder / MANIFEST).read_bytes())
+        self._bucket.put(MANIFEST, files.read_bytes(self.folder / MANIFEST))
         return found
 
 
@@ -231,5 +231,5 @@ def repair(url: str) -> list[pathlib.Path]:
         if got is not None:
             bucket.put(f"{path.name}.damaged", got[0])
             bucket.delete(path.name)
-    bucket.put(MANIFEST, (copy / MANIFEST).read_bytes())
+    bucket.put(MANIFEST, files.read_bytes(copy / MANIFEST))
     return removed

@@ -50,7 +50,7 @@ class Partial:
     def load(self, fresh: Any) -> Any:
         """Return the state kept, or `fresh` if there is none for these settings, with a line if it cannot be used."""
         try:
-            kept = plain.loads(self.path.read_bytes())
+            kept = plain.loads(files.read_bytes(self.path))
             identity, code, state = kept["identity"], kept["code"], kept["state"]
         except FileNotFoundError:
             return fresh

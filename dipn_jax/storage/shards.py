@@ -152,6 +152,7 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
       UserError: the file is missing, damaged (`DamagedShard`), not a shard, or of another schema version.
     """
     with _reading(path):
+        files.require_regular(path)
         found = pq.read_metadata(path)
         schema = found.schema.to_arrow_schema()
         meta = typed.check(typed.parse((schema.metadata or {}).get(_META_KEY, b"{}")), {"schema_version": int})

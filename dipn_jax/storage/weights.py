@@ -10,8 +10,7 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from dipn_jax import files
-from dipn_jax.errors import UserError
+from dipn_jax import command_paths, files
 from dipn_jax.networks import described
 from dipn_jax.storage import checkpoint
 
@@ -33,14 +32,13 @@ def write(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
 
     Args:
       run: a run's folder, or `builtin`.
-      out: the file.
+      out: the file, NAME.safetensors.
       network: a key of `checkpoint.NETWORKS`.
 
     Raises:
       UserError: as `checkpoint.load_network`; or `out` cannot be a file.
     """
-    if out.is_dir():
-        raise UserError(f"--out {out}: a folder; give the name of a file, such as {out / network}.safetensors")
+    command_paths.require_file(out, ".safetensors", option="out")
     model: Any = checkpoint.load_network(run, network=network)
     where = checkpoint.find(pathlib.Path(run), network=network)
     folder, meta = checkpoint.newest(where)  # type: ignore[misc]

@@ -27,6 +27,8 @@ _OBJECT = {
     "height_m?": typed.Maybe(float),
 }
 """Form of an object, beside its shape."""
+_CASES = {"cases": [{"name?": object, "objects": [dict]}]}
+"""Form of a case file."""
 _DATA = pathlib.Path(__file__).parents[1] / "data"
 
 
@@ -63,7 +65,7 @@ def load_cases(
     """
     path = hard_cases_path() if path is None else files.absolute(path)
     try:
-        cases = typed.check(typed.parse(path.read_bytes()), {"cases": [{"name?": object, "objects": [dict]}]})["cases"]
+        cases = typed.check(typed.parse(files.read_bytes(path)), _CASES)["cases"]
         names = [_name(case.get("name", i)) for i, case in enumerate(cases)]
     except OSError as error:
         raise UserError(

@@ -44,7 +44,7 @@ def tables(parts: Sequence[Part], out: pathlib.Path) -> list[Outcome]:
         listed |= {row: (part, line) for row, line in zip(part.rows(), lines, strict=True)}
     ordered = [listed[row] for row in sorted(listed)]
     for part, line in ordered:
-        files.write_atomically(typed.inside(out, line["file"]), part.path(line["file"]).read_bytes())
+        files.write_atomically(typed.inside(out, line["file"]), files.read_bytes(part.path(line["file"])))
     files.write_json(out / EPISODES, [line for _, line in ordered])
     counted = [name for name in EPISODE if name != "file"]
     return [Outcome(**{name: line[name] for name in counted}) for _, line in ordered]

@@ -68,7 +68,7 @@ def merge(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:
     except typed.Misfit as error:
         raise UserError(f"{first.folder / PART}: damaged, {error}; {first.again()}") from None
     rows = pooled(parts, about["arrays"])
-    files.write_atomically(out / FILMS, first.path(FILMS).read_bytes())
+    files.write_atomically(out / FILMS, files.read_bytes(first.path(FILMS)))
     try:
         return finish(out, rows, about["compared"])
     except KeyError as error:

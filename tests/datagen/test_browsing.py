@@ -93,15 +93,19 @@ def test_the_page_stands_alone_and_names_are_text(data: Data, tmp_path: pathlib.
 def test_what_cannot_be_shown_is_one_line(
     data: Data, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    shard = data["push"] / "shard-00000.parquet"
+    before = shard.read_bytes()
     for says, words in (
+        ("want a file whose name ends in .html", (tmp_path, "--html", shard)),
+        (f"no file can be written in {shard}", (tmp_path, "--html", shard / "p.html")),
         ("--sample 0", (data["push"], "--html", tmp_path / "p.html", "--sample", 0)),
-        ("is a folder", (data["push"], "--html", tmp_path)),
+        ("a folder; give the name of a file", (data["push"], "--html", tmp_path)),
         ("no manifest.json", (tmp_path, "--html", tmp_path / "p.html")),
     ):
         assert info(*words) == 2
         error = capsys.readouterr().err
         assert error.startswith("error: ") and error.count("\n") == 1 and says in error
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [] and shard.read_bytes() == before
 
 
 def test_a_browser_sifts(data: Data, tmp_path: pathlib.Path) -> None:

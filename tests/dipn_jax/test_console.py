@@ -1,5 +1,6 @@
 """What the commands share: paths as users give them."""
 
+import functools
 import pathlib
 from typing import Any
 
@@ -9,6 +10,7 @@ from dipn_jax.eval import cli as eval_cli
 from dipn_jax.eval.clearing.tables import Tables
 from dipn_jax.train import cli as train_cli
 
+import dipn_jax
 from dipn_jax import addresses, console, files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import resume
@@ -76,6 +78,35 @@ def test_a_home_that_is_not_there_is_one_line(capfd: pytest.CaptureFixture[str])
     assert console.run("test", datagen_cli.COMMANDS, command) == 2
     error = capfd.readouterr().err
     assert error == f"error: {command[1]}: there is no home folder for ~; give the folder's full path\n"
+
+
+@pytest.mark.parametrize(
+    ("commands", "words", "named"),
+    [
+        (train_cli, ["push", "--data", "x", "--out", ""], "--out "),
+        (train_cli, ["push", "--data", "x", "--out="], "--out "),
+        (train_cli, ["push", "--data", "x", "--out", "y", "--init", ""], "--init "),
+        (train_cli, ["push", "--data", "x", "--out", "y", "--profile", ""], "--profile "),
+        (train_cli, ["grasp", "--data", "", "--out", "y"], "--data "),
+        (datagen_cli, ["info", ""], ""),
+        (datagen_cli, ["merge", "x", "", "--out", "y"], ""),
+        (eval_cli, ["clear", "--out", "y", "--cases", ""], ""),
+    ],
+)
+def test_an_empty_path_is_not_the_folder_that_we_are_in(
+    commands: Any, words: list[str], named: str, home: pathlib.Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert console.run("test", commands.COMMANDS, words) == 2
+    assert capfd.readouterr().err.startswith(f"error: {named}'': an empty path")
+    assert not list(pathlib.Path.cwd().iterdir())
+
+
+def test_a_function_takes_no_empty_path_either() -> None:
+    network = functools.partial(dipn_jax.load_network, network="dipn")
+    for call in (network, dipn_jax.load_cases, dipn_jax.read_episodes, files.absolute):
+        with pytest.raises(UserError, match=r"^'': an empty path"):
+            call("")
+    assert files.absolute(".") == files.absolute(pathlib.Path()) == pathlib.Path.cwd()
 
 
 def test_a_user_without_a_home_has_no_cache_and_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

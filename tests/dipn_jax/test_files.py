@@ -10,8 +10,9 @@ import sys
 
 import pytest
 
-from dipn_jax import files
-from dipn_jax.storage import records
+from dipn_jax import files, typed
+from dipn_jax.errors import UserError
+from dipn_jax.storage import arrays, records, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.world import cases
 
@@ -159,3 +160,18 @@ def test_the_digest_of_the_code_covers_its_kernels(tmp_path: pathlib.Path) -> No
         found.add(files.code_digest(tmp_path))
     (tmp_path / "notes.txt").write_text("1")
     assert len(found) == 3 and files.code_digest(tmp_path) in found
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with a name here")
+def test_a_pipe_is_not_waited_for(tmp_path: pathlib.Path) -> None:
+    """Reading a pipe that nobody writes to takes for ever; each of these would hang."""
+    pipe = tmp_path / "shard-00000.parquet"
+    os.mkfifo(pipe)
+    for read in (files.read_json, files.read_lines, cases.load_cases, shards.read_meta):
+        with pytest.raises(UserError, match=f"{pipe}.*not a regular file"):
+            read(pipe)
+    for read in (files.read_bytes, files.read_text, files.file_sha256):
+        with pytest.raises(OSError, match="not a regular file"):
+            read(pipe)
+    with pytest.raises(typed.Misfit, match="not a regular file"):
+        arrays.read(pipe, {})

@@ -5,6 +5,7 @@ import pathlib
 import socket
 import subprocess
 import sys
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -110,15 +111,57 @@ def test_four_devices_learn_what_one_does_and_one_goes_on_from_there(
 def test_a_batch_that_devices_cannot_share_and_unclear_processes_are_one_line() -> None:
     with pytest.raises(UserError, match="--batch 6 --data-parallel: 4 devices share a batch; want a multiple of that"):
         devices.Shared(jax.devices() * 4, batch=6)
-    with pytest.raises(UserError, match=r"--processes 2: needs --coordinator HOST:PORT"):
-        devices.join(Compute(processes=2))
+    for given in ({"processes": 2}, {"process": 3}):
+        with pytest.raises(UserError, match=r"--processes \d --process \d: needs --coordinator HOST:PORT"):
+            Compute(**given)
     with pytest.raises(UserError, match=r"--processes 2 --process 2: want the number of processes"):
-        devices.join(Compute(coordinator="localhost:1", processes=2, process=2))
+        Compute(coordinator="localhost:1", processes=2, process=2)
+    with pytest.raises(UserError, match="--coordinator localhost:1: needs --data-parallel"):
+        Compute(coordinator="localhost:1", processes=2)
+
+
+@pytest.mark.parametrize("odd", ["nohost", "localhost:abc", ":", ":9", "localhost:", "localhost:0", "localhost:99999"])
+def test_an_address_that_is_none_is_one_line(odd: str) -> None:
+    with pytest.raises(UserError, match=f"^--coordinator {odd}: want HOST:PORT"):
+        Compute(data_parallel=True, coordinator=odd, processes=2)
+    for good in ("host-0.jobs:65535", "10.0.0.1:9911", "[::1]:9911"):
+        Compute(data_parallel=True, coordinator=good, processes=2)
+
+
+def test_processes_that_do_not_come_or_cannot_join_and_a_port_in_use_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    come = threading.Event()
+    monkeypatch.setattr(devices, "SILENCE", 0.01)
+    monkeypatch.setattr(devices, "PATIENCE", 0.05)
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: come.wait())
+    second = Compute(data_parallel=True, coordinator="localhost:9", processes=2, process=1)
+    with pytest.raises(UserError, match="--coordinator localhost:9: not all processes came within 0 s"):
+        devices.join(second)
+    come.set()
+    assert "--coordinator localhost:9: waiting for the other processes" in capsys.readouterr().err
+
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("no\nsuch job")
+
+    monkeypatch.setattr(devices, "PATIENCE", 60)
+    monkeypatch.setattr(jax.distributed, "initialize", refuse)
+    with pytest.raises(UserError, match=r"--coordinator localhost:9: cannot join \(no\?such job\)"):
+        devices.join(second)
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "8")
+    with pytest.raises(UserError, match=r"the job manager's processes: cannot join \(no\?such job\)"):
+        devices.join(Compute(data_parallel=True))
+    with socket.socket() as taken:
+        taken.bind(("", 0))
+        taken.listen()
+        coordinator = f"localhost:{taken.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"--coordinator {coordinator}: process 0 cannot listen there"):
+            devices.join(Compute(data_parallel=True, coordinator=coordinator, processes=2))
 
 
 def test_a_process_joins_others_where_a_job_manager_started_several(monkeypatch: pytest.MonkeyPatch) -> None:
     joined: list[int] = []
-    monkeypatch.setattr(jax.distributed, "initialize", lambda *_: joined.append(1))
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **_: joined.append(1))
     devices.join(Compute())
     assert not joined
     for name, value, wanted in (

@@ -46,6 +46,24 @@ def test_options_data_and_folder_can_be_checked_without_writing(
     assert [path.name for path in out.iterdir()] == ["config.json"]
 
 
+@pytest.mark.parametrize("command", ["push", "grasp-pretrain", "grasp"])
+def test_options_are_checked_before_the_data(
+    command: str, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    for wrong, says in (
+        (["--steps", "0"], "--steps 0: want a number above 0"),
+        (["--memory", "nan"], "--memory nan: want 0 to"),
+        (["--batch", "8", "--accumulate", "3"], "--batch 8 --accumulate 3: want a number that divides"),
+        (["--mix", "1", "2"], "--mix 1 2: want a number for each folder of --data, 1"),
+        (["--out", str(tmp_path / "file" / "run")], "is not a folder"),
+        (["--process", "3"], "--processes 1 --process 3: needs --coordinator"),
+    ):
+        words = [command, "--data", str(tmp_path / "none"), "--out", str(tmp_path / "run"), *wrong]
+        assert console.run("test", cli.COMMANDS, words) == 2
+        assert says in capfd.readouterr().err, wrong
+
+
 @pytest.mark.slow
 def test_learning_online_stops_at_a_loss_that_is_not_finite(engine: Any, tmp_path: pathlib.Path) -> None:
     plan = online.OnlineConfig(grasps=6, tables=2, updates=2, batch=4, learning_rate=1e39)

@@ -93,16 +93,16 @@ def test_answers_are_called_what_they_are(tmp_path: pathlib.Path) -> None:
     for kind, says in (("grasp", "logit"), ("rea", "logit"), ("vpg", "value"), ("dqn", "value")):
         network, config = CONFIGS[kind]
         saved(tmp_path / kind, network, config)
-        weights.write(tmp_path / kind, tmp_path / "w", network=network)
-        outputs = json.loads(read(tmp_path / "w")[0]["outputs"])
+        weights.write(tmp_path / kind, tmp_path / "w.safetensors", network=network)
+        outputs = json.loads(read(tmp_path / "w.safetensors")[0]["outputs"])
         assert all(one["meaning"].startswith(says) for one in outputs.values())
         assert [*outputs] == {"vpg": ["pushes", "grasps"], "dqn": ["pushes"]}.get(kind, ["grasps"])
 
 
 def test_constants_are_those_of_the_network(tmp_path: pathlib.Path) -> None:
     """What its body gets is the image less the offset, over the scale."""
-    weights.write(pathlib.Path("builtin"), tmp_path / "w", network="grasp")
-    about, stored = read(tmp_path / "w")
+    weights.write(pathlib.Path("builtin"), tmp_path / "w.safetensors", network="grasp")
+    about, stored = read(tmp_path / "w.safetensors")
     constants = json.loads(about["constants"])
     image = np.tile(np.array(constants["input_offset"], np.float32), (1, 8, 8, 1))
     model: Any = checkpoint.load_network("builtin", network="grasp")
@@ -122,33 +122,38 @@ def test_constants_are_those_of_the_network(tmp_path: pathlib.Path) -> None:
 
 def test_the_command_writes_the_same_file_again(tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
     words = ["export", "--run", "builtin", "--network", "dipn", "--format", "safetensors", "--out"]
-    for name in ("a", "b"):
+    for name in ("a.safetensors", "b.safetensors"):
         assert console.run("test", cli.COMMANDS, [*words, str(tmp_path / "new" / name)]) == 0
-    assert files.file_sha256(tmp_path / "new" / "a") == files.file_sha256(tmp_path / "new" / "b")
+    assert files.file_sha256(tmp_path / "new" / "a.safetensors") == files.file_sha256(
+        tmp_path / "new" / "b.safetensors"
+    )
     capfd.readouterr()
+    other = tmp_path / "new" / "shard-00000.parquet"
+    other.write_text("pushes")
     for out, more, says in (
         (tmp_path, (), "a folder; give the name of a file"),
-        (tmp_path / "new" / "a" / "c", (), "is not a folder"),
-        (tmp_path / "v", ("--network", "vpg"), "no vpg network comes with this package"),
-        (tmp_path / "v", ("--run", str(tmp_path / "nowhere")), "no such folder"),
+        (tmp_path / "new" / "a.safetensors" / "c.safetensors", (), "is not a folder"),
+        (other, (), "want a file whose name ends in .safetensors"),
+        (tmp_path / "v.safetensors", ("--network", "vpg"), "no vpg network comes with this package"),
+        (tmp_path / "v.safetensors", ("--run", str(tmp_path / "nowhere")), "no such folder"),
     ):
         assert console.run("test", cli.COMMANDS, [*words, str(out), *more]) == 2
         error = capfd.readouterr().err
         assert says in error and error.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    assert [path.name for path in tmp_path.iterdir()] == ["new"] and other.read_text() == "pushes"
 
 
 def test_a_file_is_read_without_jax(tmp_path: pathlib.Path) -> None:
-    weights.write(pathlib.Path("builtin"), tmp_path / "w", network="grasp")
+    weights.write(pathlib.Path("builtin"), tmp_path / "w.safetensors", network="grasp")
     script = (
         "import sys; from safetensors import safe_open; file = safe_open(sys.argv[1], 'numpy'); "
         "assert file.get_tensor('body.out.bias').shape == (16,); assert not {'jax', 'flax'} & set(sys.modules)"
     )
-    subprocess.run([sys.executable, "-c", script, str(tmp_path / "w")], check=True)
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "w.safetensors")], check=True)
 
 
 def test_a_run_of_another_network_is_refused(tmp_path: pathlib.Path) -> None:
     saved(tmp_path / "run", *CONFIGS["grasp"])
     with pytest.raises(UserError, match="holds a grasp network, want dipn"):
-        weights.write(tmp_path / "run", tmp_path / "w", network="dipn")
-    assert not (tmp_path / "w").exists()
+        weights.write(tmp_path / "run", tmp_path / "w.safetensors", network="dipn")
+    assert not (tmp_path / "w.safetensors").exists()
