@@ -1,6 +1,9 @@
 """Checkpoints in the background: nothing that training does meanwhile gets into them, and no error is lost."""
 
+import asyncio
 import errno
+import gc
+import logging
 import pathlib
 import sys
 import threading
@@ -138,3 +141,26 @@ def test_a_save_that_fails_prints_nothing_of_closed_event_loops_and_all_else(mon
     report("Event loop is closed")
     report("something else")
     assert printed[1:] == ["something else"]
+
+
+def test_writes_that_nobody_waits_for_are_not_reported_after_a_save_that_failed(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def fails() -> None:
+        raise ValueError("full")
+
+    async def forget() -> None:
+        task = asyncio.ensure_future(fails())
+        await asyncio.sleep(0.01)
+        del task
+        gc.collect()
+
+    with pytest.raises(ValueError, match="full"), quiet.failing():
+        raise ValueError("full")
+    asyncio.run(forget())
+    logging.getLogger("asyncio").error("something else")
+    assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == ["something else"]
+    with quiet.failing():
+        pass
+    asyncio.run(forget())
+    assert "never retrieved" in caplog.records[-1].getMessage()
