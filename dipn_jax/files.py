@@ -11,14 +11,13 @@ import importlib.metadata
 import json
 import os
 import pathlib
-import secrets
 import shutil
 import stat
 import time
 from collections.abc import Iterator
 from typing import Any
 
-from dipn_jax import addresses, typed
+from dipn_jax import addresses, temporary, typed
 from dipn_jax.errors import UserError
 
 EMPTY = "'': an empty path, as of a variable that is not set; give a path, or . for this folder"
@@ -132,15 +131,14 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
     Where something is raised, nothing of it is left.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # workers in containers may share process numbers
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    there = temporary.beside(path)
     try:
-        yield temporary
-        move(temporary, path)
+        yield there
+        move(there, path)
     except OSError as error:  # a write that fails does not say where
         raise OSError(error.errno, error.strerror or str(error), str(path)) from None
     finally:
-        temporary.unlink(missing_ok=True)
+        there.unlink(missing_ok=True)
 
 
 def move(source: pathlib.Path, target: pathlib.Path) -> None:
@@ -194,28 +192,6 @@ def write_text(path: pathlib.Path, text: str) -> None:
     Where the locale knows no UTF-8, Python has the bytes of a path's name as surrogates: they become those bytes again.
     """
     write_atomically(path, text.encode("utf-8", "surrogateescape"))
-
-
-def sweep(folder: pathlib.Path) -> None:
-    """Delete the temporary files and folders in `folder` (`.NAME.PID[-...].tmp`) whose process is dead.
-
-    A process of another machine looks dead here: call it only where this process owns the folder.
-    """
-    for path in folder.glob(".*.tmp") if folder.is_dir() else []:
-        number = path.name.split(".")[-2].partition("-")[0]
-        if number.isdecimal() and int(number) != os.getpid() and not alive(int(number)):
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-
-
-def alive(process: int) -> bool:
-    """Return whether there is a process of this number on this machine."""
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # somebody else's
-        return True
-    return True
 
 
 def write_json(path: pathlib.Path, value: Any) -> None:

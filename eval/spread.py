@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import pathlib
-import secrets
 import shutil
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from dipn_jax import console, files, launch
+from dipn_jax import console, files, launch, temporary
 from dipn_jax.launch import LOCAL, Launch
 
 from . import merging, options, shares
@@ -74,7 +72,7 @@ def make_part(kind: str, given: dict[str, Any]) -> None:
     from . import cli
 
     target = place(given["out"], given["share"])
-    own = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    own = temporary.beside(target)
     try:
         commands: dict[str, Any] = cli.COMMANDS
         commands[kind](**{**given, "out": own})

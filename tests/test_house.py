@@ -21,8 +21,8 @@ MOST_LINES = 300
 """Largest number of lines in a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "names", "command_words", "seeds", "typed", "interruption", "forking", "addresses", "files",
-    "command_paths", "console", "pages", "machine", "launch", "structs", "workspace", "geometry", "batching", "engine",
+    "errors", "names", "command_words", "seeds", "typed", "interruption", "forking", "addresses", "temporary",
+    "files", "command_paths", "console", "pages", "machine", "launch", "structs", "workspace", "geometry", "batching", "engine",
     "world", "physics", "sight", "networks", "storage", "planning",
 ]  # fmt: skip
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dipn_jax import console, files, structs
+from dipn_jax import console, files, structs, temporary
 from dipn_jax.errors import UserError
 from dipn_jax.storage import manifest, owner, records
 
@@ -66,7 +66,7 @@ def export(data: pathlib.Path, out: pathlib.Path, *, form: str, images: str, com
         files.claim(out, identity)
         for folder in (out, *map(out.joinpath, ("data", "parts", "meta"))):
             for place in (folder, *folder.glob("chunk-*"), *folder.glob("episodes/chunk-*")):
-                files.sweep(place)
+                temporary.sweep(place)
         _write(_writer(source, out, form, images), source, images)
         files.write_text(out / "README.md", card(source, form, images, command))
     train, test = (len(source.episodes(split)) for split in ("train", "test"))

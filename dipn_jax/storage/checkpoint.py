@@ -22,7 +22,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import console, files, forking, typed
+from dipn_jax import console, files, forking, temporary, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
 from dipn_jax.storage import owner, quiet, stored_step
@@ -75,15 +75,14 @@ def save(
       keep: number of steps that are kept.
     """
     final = run.resolve() / "checkpoints" / f"{step:08d}"
-    temporary = final.with_name(f".{final.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
+    begun = temporary.beside(final)
     about = {"network": network, "network_config": dataclasses.asdict(config), "step": step}
     try:
-        _write(temporary, parts, about, extra)
+        _write(begun, parts, about, extra)
         shutil.rmtree(final, ignore_errors=True)
-        files.move(temporary, final)
+        files.move(begun, final)
     finally:
-        files.remove_folder(temporary)
+        files.remove_folder(begun)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
     for old in older[keep - 1 :]:
         shutil.rmtree(old)

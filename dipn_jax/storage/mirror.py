@@ -9,7 +9,7 @@ import hashlib
 import pathlib
 from collections.abc import Iterator, Mapping
 
-from dipn_jax import addresses, console, files, typed
+from dipn_jax import addresses, console, files, temporary, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage.accounting import ASKED
 from dipn_jax.storage.manifest import MANIFEST
@@ -130,5 +130,5 @@ def _turn(folder: pathlib.Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             if fcntl is not None:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-        files.sweep(folder)
+        temporary.sweep(folder, shared=True)
         yield

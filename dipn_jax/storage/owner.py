@@ -10,7 +10,7 @@ import pathlib
 import socket
 from collections.abc import Iterator
 
-from dipn_jax import console, files, typed
+from dipn_jax import console, temporary, typed
 from dipn_jax.errors import UserError
 
 try:
@@ -40,7 +40,7 @@ def owned(out: pathlib.Path) -> Iterator[None]:
         about = {"host": socket.gethostname(), "pid": os.getpid(), "started": started}
         os.write(descriptor, (json.dumps(about) + "\n").encode())
         for folder in (out, out / "checkpoints"):
-            files.sweep(folder)
+            temporary.sweep(folder)
         yield
     finally:
         path.unlink(missing_ok=True)
@@ -99,7 +99,7 @@ def _dead(path: pathlib.Path) -> bool:
     pid = owner.get("pid")
     if owner.get("host") != socket.gethostname() or not isinstance(pid, int) or pid <= 0:
         return False
-    return not files.alive(pid)
+    return not temporary.alive(pid)
 
 
 def _taken(path: pathlib.Path) -> UserError:

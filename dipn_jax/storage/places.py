@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from dipn_jax import addresses, console, files
+from dipn_jax import addresses, console, files, temporary
 from dipn_jax.storage import accounting, manifest, mirror, records, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.storage.objects import Bucket
@@ -67,6 +67,7 @@ class Folder:
 
     def claim(self, claim: Claim) -> None:
         claim(self.folder)
+        temporary.sweep(self.folder, shared=True)
 
     def note(self, command: Sequence[str], *, of: int) -> None:
         accounting.note(self.folder, command, of=of)

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from dipn_jax.train import log
 
+from dipn_jax import temporary
 from dipn_jax.errors import UserError
 from dipn_jax.storage import owner
 
@@ -79,16 +80,25 @@ def test_a_system_without_file_locks_has_owners_all_the_same(
 def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.Path) -> None:
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    steps = tmp_path / "checkpoints"
-    for number in (ended.pid, os.getppid()):
-        (steps / f".00000003.{number}.tmp" / "model").mkdir(parents=True)
-        (tmp_path / f".partial.npz.{number}-0a1b2c3d.tmp").touch()
+    steps, host = tmp_path / "checkpoints", temporary._host()
+    living = f"{host}-{os.getppid()}-0a1b2c3d"
+    for process in (f"{host}-{ended.pid}-0a1b2c3d", living, "elsewher-1-0a1b2c3d"):
+        (steps / f".00000003.{process}.tmp" / "model").mkdir(parents=True)
+        (tmp_path / f".partial.npz.{process}.tmp").touch()
     (tmp_path / ".mine.tmp").touch()
+
+    def left() -> set[str]:
+        return {p.name for p in (*tmp_path.iterdir(), *steps.iterdir()) if p != steps}
+
+    temporary.sweep(tmp_path, shared=True)
+    assert {name for name in left() if name.startswith(".partial")} == {
+        f".partial.npz.{living}.tmp",
+        ".partial.npz.elsewher-1-0a1b2c3d.tmp",
+    }
     with owner.owned(tmp_path):
         pass
-    left = {p.name for p in (*tmp_path.iterdir(), *steps.iterdir())}
-    alive = os.getppid()
-    assert left == {"checkpoints", ".mine.tmp", f".00000003.{alive}.tmp", f".partial.npz.{alive}-0a1b2c3d.tmp"}
+    assert left() == {".mine.tmp", f".00000003.{living}.tmp", f".partial.npz.{living}.tmp"}
+    assert temporary.beside(tmp_path / "a").name.startswith(f".a.{host}-{os.getpid()}-")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[1]", "{", "\x00", '{"pid": "x"}'])
