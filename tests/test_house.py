@@ -22,8 +22,8 @@ MOST_LINES = 300
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
     "errors", "names", "command_words", "seeds", "typed", "interruption", "forking", "addresses", "temporary",
-    "files", "command_paths", "console", "pages", "machine", "launch", "structs", "workspace", "geometry", "batching", "engine",
-    "world", "physics", "sight", "networks", "storage", "planning",
+    "files", "command_paths", "console", "pages", "machine", "launch", "structs", "workspace", "geometry", "batching",
+    "engine", "world", "physics", "sight", "networks", "storage", "planning",
 ]  # fmt: skip
 
 

@@ -2,12 +2,14 @@
 
 import pathlib
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from dipn_jax import files
+from dipn_jax import files, temporary
 from dipn_jax.errors import UserError
 from dipn_jax.storage import manifest, mirror, places, records, shards
 from dipn_jax.storage.objects import Bucket
@@ -94,3 +96,13 @@ def test_a_damaged_shard_is_set_aside(place: Place, there: pathlib.Path) -> None
     assert not path.exists() and path.with_name(f"{path.name}.damaged").is_file()
     assert list(manifest.listed(there)) == ["shard-00000.parquet"] and records.verify(mirror.local(url)) == []
     assert place.counts([0, 1]) == {0: 16}
+
+
+def test_a_folder_is_rid_of_what_dead_processes_of_this_machine_left(tmp_path: pathlib.Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    mine, theirs = (tmp_path / f".shard.{host}-{ended.pid}-0a.tmp" for host in (temporary._host(), "elsewher"))
+    for path in (mine, theirs):
+        path.touch()
+    places.Folder(tmp_path).claim(lambda _: None)
+    assert theirs.exists() and not mine.exists()
