@@ -19,7 +19,7 @@ def verify(folder: tyro.conf.Positional[Place]) -> None:
     """Check every shard, and that all episodes that were asked for are there; exit 2 if something is wrong.
 
     Sizes, SHA-256 and columns of the shards are held against the manifest; a shard that no worker has made is named,
-    with the command that makes it.
+    with the command that makes it. A line says where versions or kinds of processor that made shards differ.
 
     Args:
       folder: a data set, or its URL.
@@ -27,7 +27,9 @@ def verify(folder: tyro.conf.Positional[Place]) -> None:
     from dipn_jax.storage import mirror, records
 
     folder = mirror.local(folder)
-    problems = records.verify(folder)
+    problems, mixed = records.examined(folder)
+    if mixed:
+        console.warn(mixed)
     if problems:
         path, what = problems[0]
         raise UserError(

@@ -24,6 +24,9 @@ from . import devices, finite, log, order, precision, profiling
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check
 from .optimizers import make_optimizer
 
+JUDGE = "held_out_loss"
+"""Measure that is lowest at the best step of a run."""
+
 
 class Taught(Protocol):
     """The part of a task that an optimizer step needs."""
@@ -48,7 +51,7 @@ class Task(Taught, Protocol):
         ...
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
-        """Return measures on examples that are held out."""
+        """Return measures on examples that are held out, JUDGE among them."""
         ...
 
 
@@ -120,7 +123,8 @@ def fit(
     Args:
       task: what to learn.
       config: how.
-      out: run folder: `config.json`, `metrics.jsonl`, `events/` (TensorBoard), `checkpoints/`.
+      out: run folder: `config.json`, `metrics.jsonl`, `events/` (TensorBoard), `checkpoints/` with the last two steps
+        and the best.
       initial: network to start from; a fresh one if not given.
       compute: how steps are computed. Several processes call this with the same arguments; one of them writes.
 
@@ -159,7 +163,7 @@ def _fit(
     if where.leads:
         _claim(out, _identity(task, config, compute, initial), config)
     where.wait("claimed")
-    moments, begin = _resume(out, model, optimizer)
+    moments, begin, best = _resume(out, model, optimizer)
     graph, *state = _split(model)
     params, rest, moments = where.everywhere((*state, moments))
     batches = order.batches(task.parts, config)
@@ -172,7 +176,7 @@ def _fit(
     def save(step: int) -> None:
         here = where.here((params, rest))
         parts = {"model": nnx.state(nnx.merge(graph, *here)), "train": where.here(moments)}
-        about = {"seed": config.seed, "data": task.fingerprint, "examples": task.examples, **latest}
+        about = {"seed": config.seed, "data": task.fingerprint, "examples": task.examples, **latest, **best}
         if where.leads:
             saver.save(step, parts, extra=about)
 
@@ -197,6 +201,8 @@ def _fit(
                 latest = {"loss": float(where.here(loss)), **task.evaluate(model)}
                 watch.check(step, where.here(params), **latest)
                 curve.write(step, latest)
+                if not best or latest[JUDGE] < best["best"]["value"]:
+                    best, due = {"best": {"step": step, "measure": JUDGE, "value": latest[JUDGE]}}, True
             if due:
                 save(step)
             if stopping:
@@ -226,15 +232,21 @@ def _compile(
     return {f"{name}_mb": size / 1e6 for name, size in sizes.items()}
 
 
-def _resume(out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTransformation) -> tuple[Any, int]:
-    """Return the optimizer's state and the step to begin with; earlier weights of the run are put into `model`."""
+def _resume(
+    out: pathlib.Path, model: nnx.Module, optimizer: optax.GradientTransformation
+) -> tuple[Any, int, dict[str, Any]]:
+    """Return the optimizer's state, the step to begin with, and the best step so far as metadata of a step have it.
+
+    Earlier weights of the run are put into `model`.
+    """
     moments = optimizer.init(_split(model)[1])
     found = checkpoint.newest(out)
     if found is None:
-        return moments, 0
+        return moments, 0, {}
     folder, meta = found
     nnx.update(model, checkpoint.restore(folder, "model", nnx.state(model)))
-    return checkpoint.restore(folder, "train", moments), int(meta["step"])
+    best = {"best": meta["best"]} if "best" in meta else {}
+    return checkpoint.restore(folder, "train", moments), int(meta["step"]), best
 
 
 def _identity(task: Task, config: TrainConfig, compute: Compute, initial: nnx.Module | None) -> dict[str, Any]:

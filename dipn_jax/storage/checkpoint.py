@@ -17,7 +17,6 @@ import shutil
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
@@ -25,9 +24,12 @@ from flax import nnx
 from dipn_jax import console, files, forking, temporary, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
-from dipn_jax.storage import owner, quiet, stored_step
+from dipn_jax.storage import leaves, owner, quiet, stored_step
 
-WANTED = "give a run (the --out of dipn-train), one step of it (RUN@STEP) or that step's folder (RUN/checkpoints/STEP)"
+WANTED = (
+    "give a run (the --out of dipn-train), one step of it (RUN@STEP, RUN@best) or that step's folder "
+    "(RUN/checkpoints/STEP)"
+)
 """What is accepted where a network is asked for, for messages."""
 SHIPPED = pathlib.Path(__file__).parents[1] / "data"
 """Folder of the runs that come with the package, one a network."""
@@ -63,7 +65,7 @@ def _flat(tree: Any) -> dict[str, Any]:
 def save(
     run: pathlib.Path, step: int, parts: dict[str, Any], *, network: str, config: Any, extra: Any, keep: int = 2
 ) -> None:
-    """Write one step, atomically, and drop all but the newest `keep`.
+    """Write one step, atomically, and drop all but the newest `keep` and the best.
 
     Args:
       run: the run's folder.
@@ -71,7 +73,8 @@ def save(
       parts: pytrees of arrays, one Orbax folder each; `model` is what `load_network` reads.
       network: a key of NETWORKS.
       config: the network's config dataclass.
-      extra: seed, data fingerprint, training config; it has to fit into JSON.
+      extra: seed, data fingerprint, training config, and `best` as `stored_step.FORM` has it, if there is a best step;
+        it has to fit into JSON.
       keep: number of steps that are kept.
     """
     final = run.resolve() / "checkpoints" / f"{step:08d}"
@@ -85,7 +88,8 @@ def save(
         files.remove_folder(begun)
     older = [folder for folder in _steps(run) if int(folder.name) < step and _whole(folder) is not None]
     for old in older[keep - 1 :]:
-        shutil.rmtree(old)
+        if int(old.name) != extra.get("best", {}).get("step"):
+            shutil.rmtree(old)
 
 
 def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], extra: Any) -> None:
@@ -197,31 +201,15 @@ def restore(folder: pathlib.Path, name: str, target: Any) -> Any:
     stored = stored_step.arrays((folder / name).resolve())
     wanted = _flat(target)
     different = sorted(set(stored) ^ set(wanted)) + [
-        key for key in wanted if key in stored and stored[key].shape != _stored_shape(wanted[key])
+        key for key in wanted if key in stored and stored[key].shape != leaves.stored_shape(wanted[key])
     ]
     if different:
         raise UserError(
             f"checkpoint {folder}: made for another architecture ({len(different)} arrays differ, first "
             f"{different[0]}); train again, or give the run it belongs to"
         )
-    leaves = [_on_device(stored[key], like=leaf) for key, leaf in wanted.items()]
-    return jax.tree.unflatten(jax.tree.structure(target), leaves)
-
-
-def is_key(leaf: Any) -> bool:
-    """Return whether a leaf is a random key (dropout's), which is stored as its numbers."""
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _stored_shape(leaf: Any) -> tuple[int, ...]:
-    """Return the shape that a leaf is stored in."""
-    return np.shape(jax.random.key_data(leaf) if is_key(leaf) else leaf)
-
-
-def _on_device(stored: np.ndarray, *, like: Any) -> jax.Array:
-    """Return a copy of `stored` on the default device (training donates its buffers); a random key if `like` is one."""
-    array = jnp.array(stored)
-    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(like)) if is_key(like) else array
+    found = [leaves.on_device(stored[key], like=leaf) for key, leaf in wanted.items()]
+    return jax.tree.unflatten(jax.tree.structure(target), found)
 
 
 def digest(model: nnx.Module) -> str:
@@ -233,24 +221,36 @@ def digest(model: nnx.Module) -> str:
 
 
 def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
-    """Return the folder of a run, or of one step of it where `RUN@STEP` is given.
+    """Return the folder of a run, or of one step of it where `RUN@STEP` or `RUN@best` is given.
 
     `builtin` stands for the network that comes with the package, if one does.
+
+    Raises:
+      UserError: there is no such step, or no such network in the package.
     """
-    base, at, step = str(run).rpartition("@")
-    if at and step.isdecimal() and not run.exists():
-        steps = _steps(pathlib.Path(base))
-        for folder in steps:
-            if int(folder.name) == int(step):
-                return folder
-        kept = f"it has {', '.join(str(int(p.name)) for p in steps)}" if steps else "it has none"
-        raise UserError(f"checkpoint {run}: no such step of {base}; {kept}")
+    base, _, step = str(run).rpartition("@")
+    if base and (step == "best" or step.isdecimal()) and not run.exists():
+        return _step(find(pathlib.Path(base), network=network), step)
     if str(run) != "builtin":
         return files.absolute(run)
     folder = SHIPPED / network
     if not folder.is_dir():
         raise UserError(f"builtin: no {network} network comes with this package; give the --out of a dipn-train run")
     return folder
+
+
+def _step(run: pathlib.Path, step: str) -> pathlib.Path:
+    """Return the folder of a step of a run by its number, or of the best as its newest whole step knows it."""
+    steps = {int(folder.name): folder for folder in _steps(run)}
+    kept = f"it has {', '.join(map(str, steps))}" if steps else "it has none"
+    if step == "best":
+        found = newest(run)
+        if found is None or "best" not in found[1]:
+            raise UserError(f"checkpoint {run}@best: this run knows no best step; give RUN or RUN@STEP ({kept})")
+        step = str(found[1]["best"]["step"])
+    if int(step) not in steps:
+        raise UserError(f"checkpoint {run}@{step}: no such step of {run}; {kept}")
+    return steps[int(step)]
 
 
 def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Module:

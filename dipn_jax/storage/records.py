@@ -19,47 +19,58 @@ from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 
 PROGRESS_SHARDS = 100
 """Number of shards from which on progress is shown while they are read."""
+Problems = list[tuple[pathlib.Path, str]]
+"""Shards, each with what is wrong with it."""
+Look = tuple[str, dict[str, Any] | None]
+"""What is wrong with a shard, an empty text if nothing is; and then its metadata."""
 
 
-def _problem(path: pathlib.Path, entry: dict[str, Any]) -> str:
-    """Return what is wrong with a shard that the manifest lists so; an empty text if nothing is."""
+def _look(path: pathlib.Path, entry: dict[str, Any]) -> Look:
+    """Return what is wrong with a shard that the manifest lists so, and its metadata where nothing is."""
     if not path.is_file():
-        return "missing"
+        return "missing", None
     if path.stat().st_size != entry["bytes"]:
-        return f"{path.stat().st_size} bytes, want {entry['bytes']}"
+        return f"{path.stat().st_size} bytes, want {entry['bytes']}", None
     if files.file_sha256(path) != entry["sha256"]:
-        return "SHA-256 differs from the manifest's"
+        return "SHA-256 differs from the manifest's", None
     try:
         meta = shards.read_meta(path)  # of this schema version
     except shards.DamagedShard as error:
-        return error.what
+        return error.what, None
     if (meta["episodes"], meta["kind"]) != (entry["episodes"], entry["kind"]):
-        return f"{meta['episodes']} {meta['kind']} episodes, want {entry['episodes']} {entry['kind']}"
-    return ""
+        return f"{meta['episodes']} {meta['kind']} episodes, want {entry['episodes']} {entry['kind']}", None
+    return "", meta
 
 
-def verify(folder: pathlib.Path) -> list[tuple[pathlib.Path, str]]:
+def _look_through(path: pathlib.Path) -> Look:
+    """Return why a shard cannot be read to its end, and its metadata where it can."""
+    if not path.is_file():
+        return "missing", None
+    try:
+        meta = shards.read_meta(path)
+        shards.read_shard(path, kind=meta["kind"])
+    except shards.DamagedShard as error:
+        return error.what, None
+    return "", meta
+
+
+def verify(folder: pathlib.Path) -> Problems:
     """Return the shards that are missing or damaged, each with what is wrong; empty if none is.
 
     Those that the manifest does not list are read to their end.
     """
+    return examined(folder)[0]
+
+
+def examined(folder: pathlib.Path) -> tuple[Problems, str | None]:
+    """Return what `verify` does, and in one line what differs between those who made the shards that are whole."""
     listed = manifest.listed(folder)
     paths = [folder / name for name in listed]
     with concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool:
-        checked = list(zip(paths, pool.map(_problem, paths, listed.values()), strict=True))
-    checked += [(path, _unreadable(path)) for path in manifest.unlisted(folder, listed)]
-    return [(path, what) for path, what in checked if what]
-
-
-def _unreadable(path: pathlib.Path) -> str:
-    """Return why a shard cannot be read to its end; an empty text if it can."""
-    if not path.is_file():
-        return "missing"
-    try:
-        shards.read_shard(path, kind=shards.read_meta(path)["kind"])
-    except shards.DamagedShard as error:
-        return error.what
-    return ""
+        looks = list(zip(paths, pool.map(_look, paths, listed.values()), strict=True))
+    looks += [(path, _look_through(path)) for path in manifest.unlisted(folder, listed)]
+    mixed = accounting.mixed(accounting.makers([meta for _, (_, meta) in looks if meta is not None]))
+    return [(path, what) for path, (what, _) in looks if what], mixed and f"{folder}: {mixed}"
 
 
 def repair(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -88,7 +99,7 @@ def _good(path: pathlib.Path, entry: dict[str, Any] | None) -> bool:
     """Return whether a shard can be read to its end, and is the one that the manifest lists, if it lists one."""
     if entry is not None and (not path.is_file() or files.file_sha256(path) != entry["sha256"]):
         return False
-    return not _unreadable(path)
+    return not _look_through(path)[0]
 
 
 def summary(folder: pathlib.Path) -> dict[str, Any]:
@@ -207,7 +218,7 @@ def fingerprint(entries: dict[str, Any]) -> str:
 def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
     """Return the entry of every shard of a data set, which has one at least, after checking each.
 
-    Where episodes that were asked for have not been made, one line says so.
+    One line says where those who made them differ, and one where episodes that were asked for have not been made.
 
     Args:
       folder: the data set.
@@ -216,7 +227,9 @@ def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
     Raises:
       UserError: no such data set, or a shard is missing or damaged.
     """
-    found = whole(folder, kind=kind)
+    found, mixed = _whole(folder, kind=kind)
+    if mixed:
+        console.warn(mixed)
     try:
         said = accounting.missing(folder, accounting.held(found))
     except UserError as error:  # what was asked for cannot be read; the shards are whole all the same
@@ -227,8 +240,14 @@ def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
 
 
 def whole(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
-    """Return the entries of a data set as `checked` does, whatever is missing of what was asked for."""
-    if problems := verify(folder):
+    """Return the entries of a data set as `checked` does, and say nothing of what is missing or differs."""
+    return _whole(folder, kind=kind)[0]
+
+
+def _whole(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], str | None]:
+    """Return the entries of a data set, and what differs between those who made it; as `checked` otherwise."""
+    problems, mixed = examined(folder)
+    if problems:
         path, what = problems[0]
         raise UserError(
             f"data set {folder}: {path.name} {what} ({len(problems)} shards wrong in all); "
@@ -237,4 +256,4 @@ def whole(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
     found = manifest.entries(folder)
     if not found:
         raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
-    return found
+    return found, mixed

@@ -12,7 +12,7 @@ import numpy as np
 
 from dipn_jax import console
 from dipn_jax.errors import UserError
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, leaves
 
 
 class Saver:
@@ -71,5 +71,5 @@ class Saver:
 
 def on_host(tree: Any) -> Any:
     """Return a copy of a pytree as NumPy arrays that share no memory with it; random keys become their numbers."""
-    numbers = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if checkpoint.is_key(leaf) else leaf, tree)
+    numbers = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if leaves.is_key(leaf) else leaf, tree)
     return jax.tree.map(np.array, jax.device_get(numbers))

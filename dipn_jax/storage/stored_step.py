@@ -22,8 +22,9 @@ FORM = {
     "step": typed.Whole(),
     "sha256": {str: str},
     "versions?": dict,
+    "best?": {"step": typed.Whole(), "measure": str, "value": float},
 }
-"""Form of `meta.json`."""
+"""Form of `meta.json`; `best` says at which step of the run so far a measure was lowest, that step included."""
 LARGEST = 65_536
 """Largest number in a network's config."""
 

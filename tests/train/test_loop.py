@@ -52,7 +52,7 @@ def test_a_run_that_is_going_on_is_not_started_again(
     monkeypatch.setattr(task, "fetch", again)
     with pytest.raises(UserError, match=f"in use by host .*, pid {os.getpid()}, started"):
         fit(task, BRIEF, tmp_path)
-    with pytest.raises(UserError, match="in use"), rounds.Run(tmp_path, {}), rounds.Run(tmp_path, {}):
+    with pytest.raises(UserError, match="in use"), rounds.Run(tmp_path / "r", {}), rounds.Run(tmp_path / "r", {}):
         pass
     assert not (tmp_path / "owner.json").exists()
 

@@ -2,6 +2,7 @@
 `test_baseline`.
 """
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -70,6 +71,20 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(
     assert lines[0] == lines[1]
     assert [json.loads(line)["step"] for line in lines[0].splitlines()] == [3, 6]
     assert list((tmp_path / "cut" / "events").iterdir())
+
+
+def test_the_best_step_is_saved_kept_and_known_to_a_run_that_goes_on(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is saved where no checkpoint was due, and stays when the run is resumed and is worse."""
+    task, losses = _task("push", data), iter([0.5, 0.2, 0.9, 0.8, 0.7, 0.1])
+    monkeypatch.setattr(task, "evaluate", lambda _: {"held_out_loss": next(losses)})
+    plan = TrainConfig(steps=3, batch=4, optimizer="sgd", eval_every=1, save_every=100)
+    for steps, kept, best in ((3, [2, 3], 2), (5, [2, 3, 5], 2), (6, [5, 6], 6)):
+        fit(task, dataclasses.replace(plan, steps=steps), tmp_path)
+        assert sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir()) == kept
+        found = checkpoint.find(pathlib.Path(f"{tmp_path}@best"), network="dipn")
+        assert int(found.name) == best
 
 
 @pytest.mark.parametrize("step", [3, 6])

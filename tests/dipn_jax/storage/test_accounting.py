@@ -1,5 +1,6 @@
 """What a data set holds is compared with what was asked for, and who made it is listed."""
 
+import functools
 import json
 import pathlib
 import shutil
@@ -162,12 +163,13 @@ def test_everybody_who_made_shards_is_listed_and_a_mix_is_said(
     update_manifest(copy)
     made_by: list[dict[str, Any]] = records.summary(copy)["made_by"]
     assert [one["shards"] for one in made_by] == [1, 1]
-    upkeep.info(copy)
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1 and "different versions or kinds of processor" in line
-    for fact in ("Abacus (", f"{alone['processor']} (", f"mujoco {alone['versions']['mujoco']} and mujoco 9.9"):
-        assert fact in line
-    assert "numpy" not in line, "which is the same"
+    for look in (upkeep.info, upkeep.verify, functools.partial(records.load, kind="push")):
+        look(copy)
+        line = capsys.readouterr().err
+        assert line.count("\n") == 1 and "different versions or kinds of processor" in line
+        for fact in ("Abacus (", f"{alone['processor']} (", f"mujoco {alone['versions']['mujoco']} and mujoco 9.9"):
+            assert fact in line
+        assert "numpy" not in line, "which is the same"
 
 
 def test_a_shard_that_does_not_say_who_made_it_is_read(copy: pathlib.Path) -> None:

@@ -25,6 +25,12 @@ def _save(run: pathlib.Path, step: int, seed: int = 0) -> nnx.Module:
     return model
 
 
+def _save_with_best(run: pathlib.Path, step: int, best: int) -> None:
+    extra = {"best": {"step": best, "measure": "held_out_loss", "value": 0.5}}
+    parts = {"model": nnx.state(checkpoint.build("grasp", CONFIG, seed=step))}
+    checkpoint.save(run, step, parts, network="grasp", config=CONFIG, extra=extra)
+
+
 def _leaves(model: nnx.Module) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(nnx.state(model))]
 
@@ -111,6 +117,32 @@ def test_a_damaged_step_is_skipped(tmp_path: pathlib.Path, damage: str) -> None:
         (step / "meta.json").unlink()
     loaded = checkpoint.load_network(tmp_path, network="grasp")
     np.testing.assert_array_equal(_leaves(loaded)[0], _leaves(good)[0])
+
+
+def test_the_best_step_is_kept_and_found(tmp_path: pathlib.Path) -> None:
+    for step, best in ((1, 1), (2, 2), (3, 2), (4, 2), (5, 2)):
+        _save_with_best(tmp_path, step, best)
+    assert sorted(int(p.name) for p in (tmp_path / "checkpoints").iterdir()) == [2, 4, 5]
+    best = checkpoint.load_network(f"{tmp_path}@best", network="grasp")
+    wanted = checkpoint.build("grasp", CONFIG, seed=2)
+    np.testing.assert_array_equal(_leaves(best)[0], _leaves(wanted)[0])
+    found = checkpoint.find(pathlib.Path(f"{tmp_path}@best"), network="grasp")
+    assert checkpoint.used(found)["step"] == 2  # type: ignore[index]
+    _save_with_best(tmp_path, 6, 6)
+    assert sorted(int(p.name) for p in (tmp_path / "checkpoints").iterdir()) == [5, 6]
+
+
+def test_a_best_step_that_is_unknown_or_gone_is_one_line(tmp_path: pathlib.Path) -> None:
+    _save(tmp_path / "acted", 3)
+    with pytest.raises(UserError, match=r"acted@best: this run knows no best step; give RUN or RUN@STEP \(it has 3\)"):
+        checkpoint.load_network(f"{tmp_path / 'acted'}@best", network="grasp")
+    with pytest.raises(UserError, match=r"none@best: this run knows no best step; .*it has none"):
+        checkpoint.load_network(f"{tmp_path / 'none'}@best", network="grasp")
+    with pytest.raises(UserError, match=r"@7: no such step of .*data/grasp; it has \d+$"):
+        checkpoint.load_network("builtin@7", network="grasp")
+    _save_with_best(tmp_path / "lost", 3, 2)
+    with pytest.raises(UserError, match=r"lost@2: no such step of .*lost; it has 3$"):
+        checkpoint.load_network(f"{tmp_path / 'lost'}@best", network="grasp")
 
 
 def test_only_the_newest_steps_are_kept(tmp_path: pathlib.Path) -> None:
