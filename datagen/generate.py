@@ -73,7 +73,7 @@ class Job:
             )
         number = len(self.distances)
         if len(set(self.distances)) < max(number, 1):
-            raise UserError(f"--distances {self.distances}: want at least one, and none twice")
+            raise UserError(f"--distances {' '.join(map(str, self.distances))}: want at least one, and none twice")
         if self.episodes % number or self.shard_size % number:
             raise UserError(
                 f"--episodes {self.episodes} --shard-size {self.shard_size}: want multiples of {number}, the number of "
@@ -143,7 +143,8 @@ def shard(
         counts.update(batch.counts)
         empty = empty + 1 if batch.episodes is None else 0
         if empty == MAX_ATTEMPTS:
-            raise UserError(f"no usable episode in {MAX_ATTEMPTS} batches ({dict(counts)}); loosen the scene config")
+            said = ", ".join(f"{number} {name}" for name, number in counts.items())
+            raise UserError(f"no usable episode in {MAX_ATTEMPTS} batches ({said}); give fewer --objects, or others")
         fresh = 0 if batch.episodes is None else min(len(batch.episodes.fault), want - have)
         if fresh:
             done.append(structs.take(batch.episodes, slice(0, fresh)))

@@ -51,8 +51,8 @@ def repair(folder: tyro.conf.Positional[Place]) -> None:
 
     address = addresses.url(folder)
     removed = places.repair(address) if address else records.repair(folder)
-    folder = mirror.local(folder)
-    console.say(f"{folder}: {len(removed)} damaged shards set aside {[p.name for p in removed]}")
+    folder, names = mirror.local(folder), ", ".join(path.name for path in removed)
+    console.say(f"{folder}: {len(removed)} damaged shards set aside{names and f': {names}'}")
     console.say(records.missing(folder) or f"{folder}: nothing is missing")
 
 

@@ -180,6 +180,19 @@ def test_bytes_are_read_in_one_place() -> None:
             assert not [name for name, _ in _calls(path) if re.search(r"(?<!^files)\.read_bytes$", name)], path
 
 
+def test_no_message_shows_a_list_of_python() -> None:
+    """A user reads words, not brackets and quotes; but shapes of arrays are tuples."""
+    collections = (ast.List, ast.Dict, ast.Set, ast.ListComp, ast.SetComp, ast.DictComp)
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for called, call in _calls(path):
+                if re.search(r"(^|\.)(UserError|say|warn|note)$", called):
+                    shown = [part.value for part in ast.walk(call) if isinstance(part, ast.FormattedValue)]
+                    made = [one for one in shown if isinstance(one, collections)]
+                    made += [one for one in shown if re.match(r"(sorted|list|dict|set)\(", ast.unparse(one))]
+                    assert not made, f"{path}: {ast.unparse(call)}"
+
+
 def test_nothing_is_pickled() -> None:
     """Unpickling would run what is in a file; every call of NumPy that could do so has `allow_pickle=False`."""
     forbidden = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}

@@ -62,7 +62,9 @@ class PushTask:
           room: where the examples of a `compact` network are kept.
         """
         if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
-            raise UserError(f"--centimetres {centimetres}: want whole numbers from 1 to {PUSH_STEPS}")
+            raise UserError(
+                f"--centimetres {' '.join(map(str, centimetres))}: want whole numbers from 1 to {PUSH_STEPS}"
+            )
 
         def choose(episodes: PushEpisode, folder: pathlib.Path) -> PushEpisode:
             return _chosen(episodes, folder, centimetres, without)
@@ -182,7 +184,8 @@ def _chosen(
         episodes = structs.take(episodes, kept)
     shortest = 100 * float(np.min(episodes.push.distance))
     if min(centimetres) > shortest + 0.01:
-        raise UserError(f"--centimetres {centimetres}: {folder} has pushes of {shortest:.0f} cm; give as low a number")
+        given = " ".join(map(str, centimetres))
+        raise UserError(f"--centimetres {given}: {folder} has pushes of {shortest:.0f} cm; give as low a number")
     return episodes
 
 

@@ -103,7 +103,8 @@ def open_source(folder: pathlib.Path) -> Source:
     found = _surveyed(folder, entries)
     widths = {_slots(shard.path) for shard in found}
     if len(widths) > 1:
-        raise UserError(f"data set {folder}: shards with {sorted(widths)} object slots; want one number in a folder")
+        said = " and ".join(map(str, sorted(widths)))
+        raise UserError(f"data set {folder}: shards with {said} object slots; want one number in a folder")
     count = sum(shard.count for shard in found)
     cut = held_out.cut((shards.read_sizes(shard.path) for shard in found), count, folder)
     return Source(folder, kind, widths.pop(), found, cut, records.fingerprint(entries))

@@ -65,7 +65,7 @@ def substeps(config: PhysicsConfig) -> int:
     count = round(CONTROL_PERIOD / config.timestep) if config.timestep >= CONTROL_PERIOD / MOST_SUBSTEPS else 0
     if count < 1 or abs(count * config.timestep - CONTROL_PERIOD) > 1e-9:
         raise UserError(
-            f"physics timestep {config.timestep}: want {CONTROL_PERIOD} over a whole number from 1 to {MOST_SUBSTEPS}"
+            f"--timestep {config.timestep}: want {CONTROL_PERIOD} over a whole number from 1 to {MOST_SUBSTEPS}"
         )
     return count
 

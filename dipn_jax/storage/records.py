@@ -197,8 +197,9 @@ def _joined(counts: dict[pathlib.Path, int], *, kind: str) -> Any:
     def put(path: pathlib.Path, end: int) -> None:
         part = shards.read_shard(path, kind=kind)
         if (its := part.scene.shape.shape[1]) != slots:
+            few, many = sorted((slots, its))
             raise UserError(
-                f"data set {path.parent}: shards with {sorted((slots, its))} object slots; want one number in a folder"
+                f"data set {path.parent}: shards with {few} and {many} object slots; want one number in a folder"
             )
         for leaf, read in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
             leaf[end - counts[path] : end] = read

@@ -71,7 +71,7 @@ def hard_instances(
     wanted = names or found
     missing = [name for name in wanted if name not in found]
     if missing:
-        raise UserError(f"cases {missing}: not in {path}; it has {found}")
+        raise UserError(f"--names {' '.join(missing)}: not in {path}; it has {', '.join(found)}")
     index = np.array([found.index(name) for name in wanted for _ in range(repeats)])
     scene, poses = structs.take(scene, index), poses[index].copy()
     mass, friction = np.array(scene.mass), np.array(scene.friction)

@@ -18,7 +18,7 @@ from dipn_jax.storage import arrays
 
 from .. import drawing, metrics
 from ..clearing import sweeping
-from . import comparison
+from . import comparison, networks
 
 FILM_ROWS = 4
 """Number of pushes in the figure of predictions."""
@@ -85,6 +85,8 @@ def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, An
         if sources.grasp:
             values |= metrics.read(sources.grasp)
             parts.append(_grasp_section(values))
+        if evaluated := _evaluated(sources):
+            parts.append(f"<h2>Networks</h2>{networks.table(evaluated)}")
         if sources.runs:
             figures["curves"] = _curves(sources.runs)
             parts.append("<h2>Learning curves</h2>{curves}")
@@ -93,6 +95,13 @@ def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, An
             f"report: a folder lacks {typed.brief(str(error))}; give the folders that dipn-eval wrote"
         ) from None
     return values, parts, figures
+
+
+def _evaluated(sources: Sources) -> dict[pathlib.Path, str]:
+    """Return the folders of evaluations, each with the name of what was evaluated."""
+    single = {"sweep": sources.sweep, "prediction": sources.prediction, "grasp": sources.grasp}
+    found = dict.fromkeys(sources.clears, "clear")
+    return found | {folder: name for name, folder in single.items() if folder is not None}
 
 
 def _figure(value: float | None) -> str:

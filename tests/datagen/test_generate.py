@@ -180,8 +180,10 @@ def test_invalid_options_are_refused(tmp_path: pathlib.Path) -> None:
     for distances in ((), (0.2,), (0.05, float("nan"))):
         with pytest.raises(UserError, match="--distances"):
             dataclasses.replace(JOB, distances=distances)
-    for timestep in (-0.002, 0.004, 0.0, 1e-9, 1e-320):
-        with pytest.raises(UserError, match="timestep"):
+    with pytest.raises(UserError, match=r"--distances 0.05 0.05: want"):
+        dataclasses.replace(JOB, distances=(0.05, 0.05))
+    for timestep in (-0.002, 0.004, 0.0, 1e-9, 1e-320, float("nan")):
+        with pytest.raises(UserError, match=f"--timestep {timestep}: want"):
             generate(dataclasses.replace(JOB, timestep=timestep), tmp_path / "x")
     with pytest.raises(UserError, match="100001 shards, more than"):
         dataclasses.replace(JOB, episodes=100_001, shard_size=1)

@@ -66,13 +66,35 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("error")
-def test_forked_workers_read_and_spawned_ones_render(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
-    (tmp_path / "work.py").write_text(SCRIPT)
+LOADER = """
+import sys
+import jax.numpy as jnp, torch
+from torch.utils.data import DataLoader, Dataset
+import dipn_jax
+
+class Pushes(Dataset):
+    def __len__(self):
+        return 8
+
+    def __getitem__(self, i):
+        return torch.from_numpy(dipn_jax.read_episodes(sys.argv[1]).poses[i].copy())
+
+if __name__ == "__main__":
+    wanted = torch.from_numpy(dipn_jax.read_episodes(sys.argv[1]).poses[:8].copy())
+    jnp.zeros(1).block_until_ready()  # JAX has computed before workers are forked
+    loader = DataLoader(Pushes(), batch_size=4, num_workers=2, multiprocessing_context="fork", timeout=120)
+    assert torch.equal(torch.cat(list(loader)), wanted)
+    print("as wanted")
+"""
+"""Episodes as examples of PyTorch, read by two forked workers."""
+
+
+def _run(script: str, data: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    """Run a script on a data set in a process of its own, which has to say that all is as wanted."""
+    (tmp_path / "work.py").write_text(script)
     kept = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)}
     done = subprocess.run(
-        [sys.executable, str(tmp_path / "work.py"), str(data["push"])],
+        [sys.executable, str(tmp_path / "work.py"), str(data)],
         capture_output=True,
         text=True,
         timeout=400,
@@ -80,6 +102,17 @@ def test_forked_workers_read_and_spawned_ones_render(data: dict[str, pathlib.Pat
         check=False,
     )
     assert done.stdout == "as wanted\n", done.stderr[-3000:]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error")
+def test_forked_workers_read_and_spawned_ones_render(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    _run(SCRIPT, data["push"], tmp_path)
+
+
+def test_workers_of_pytorch_read(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    pytest.importorskip("torch")
+    _run(LOADER, data["push"], tmp_path)
 
 
 def test_a_guarded_function_checks_before_every_call(monkeypatch: pytest.MonkeyPatch) -> None:

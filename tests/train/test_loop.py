@@ -253,7 +253,7 @@ def test_masks_found_in_the_image_give_the_same_targets_for_the_same_objects(
 
 
 def test_invalid_options_are_refused(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
-    with pytest.raises(UserError, match="--centimetres"):
+    with pytest.raises(UserError, match="--centimetres 0 5: want"):
         PushTask(data["push"], SMALL, limit=None, centimetres=(0, 5))
     with pytest.raises(UserError, match="--limit 1000"):
         PushTask(data["push"], SMALL, limit=1000, centimetres=(5,))

@@ -134,7 +134,7 @@ def test_a_damaged_shard_is_one_line_wherever_it_is_read_and_is_set_aside(
         _one_line(lambda: records.summary(copy), says)
     assert _command("repair", copy) == 0
     said = capsys.readouterr().out
-    assert "1 damaged shards set aside ['shard-00001.parquet']" in said
+    assert "1 damaged shards set aside: shard-00001.parquet" in said
     assert f"16 of 24 episodes, shard 1 missing: run `dipn-datagen push --episodes 24 --out {copy}`" in said
     assert path.with_suffix(".parquet.damaged").exists() and not path.exists()
     assert records.verify(copy) == [] and len(records.load(copy, kind="push")[0].fault) == 16

@@ -41,6 +41,7 @@ def test_the_report_is_one_file_with_its_pictures(
     merged = page.write(tmp_path, sources)
     written = (tmp_path / "report.html").read_text()
     assert written.count("data:image/png;base64,") == 5
+    assert "<h2>Networks</h2><table>" in written
     assert "74.4" in written, "the paper's numbers stand beside"
     assert 'src="http' not in written and "href=" not in written
     assert merged["clear/hard/dipn+gn/completion"] == metrics.read(cleared[1])["completion"]
@@ -88,6 +89,7 @@ def test_what_users_named_is_text_in_pages_and_figures(name: str, cleared: Any, 
     tags.feed(text)
     ours = {"html", "meta", "title", "style", "h1", "h2", "h3", "h4", "p", "table", "tr", "th", "td", "img"}
     assert tags.found == ours, "none of them comes from a name"
+    assert "<h2>Networks</h2><table>" in text
     assert text.count("data:image/png;base64,") == 4, "each figure stands in its place, once"
 
 
