@@ -143,7 +143,7 @@ def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
     """
     model = load_network(run, network=network)
     folder, meta = newest(find(run, network=network))  # type: ignore[misc]
-    known = ("format_version", "network", "network_config", "step", "versions", "sha256")
+    known = ("format_version", "network", "network_config", "step", "versions", "sha256", "best")
     extra = {key: value for key, value in meta.items() if key not in known}
     config = stored_step.config(NETWORKS[network][0], meta["network_config"])
     with owner.owned(out):
