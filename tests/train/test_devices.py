@@ -99,7 +99,7 @@ def test_four_devices_learn_what_one_does_and_one_goes_on_from_there(
     tmp_path: pathlib.Path,
 ) -> None:
     _start(data["push"], tmp_path)
-    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [f"{devices.SYNC_EVERY:08d}"]
+    assert max(path.name for path in (tmp_path / "checkpoints").iterdir()) == f"{devices.SYNC_EVERY:08d}"
     fit(task, WHOLE, tmp_path)
     together = files.read_lines(tmp_path / "metrics.jsonl")
     assert [line["step"] for line in together] == [4, 8, 12] and alone[2]["loss"] != alone[0]["loss"]
