@@ -13,14 +13,14 @@ import socket
 
 
 def beside(path: pathlib.Path) -> pathlib.Path:
-    """Return a path beside `path`, `.NAME.HOST-PID-TOKEN.tmp`, for what gets its name when it is whole."""
+    """Return a temporary path in the folder of `path`: `.NAME.HOST-PID-TOKEN.tmp`."""
     token = secrets.token_hex(4)  # workers in containers may share process numbers
     return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{token}.tmp")
 
 
 @functools.cache
 def _host() -> str:
-    """Return what stands in the names of temporary files for the machine and container whose processes we see."""
+    """Return eight digits that identify this machine and container, in which process numbers are unique."""
     known = [socket.gethostname()]
     with contextlib.suppress(OSError):  # not Linux
         known.append(pathlib.Path("/proc/sys/kernel/random/boot_id").read_text(encoding="utf-8"))
@@ -33,12 +33,14 @@ def sweep(folder: pathlib.Path, *, shared: bool = False) -> None:
 
     Args:
       folder: where they are; it need not exist.
-      shared: whether other machines may be writing there, so that theirs stay; if not, no other machine is.
+      shared: other machines may be writing there, so their files stay; otherwise these are deleted, too.
     """
     for path in folder.glob(".*.tmp") if folder.is_dir() else []:
         host, number, *_ = [*path.name.split(".")[-2].split("-"), ""]
-        dead = not alive(int(number)) if host == _host() and number.isdecimal() else not shared
-        if number.isdecimal() and dead:
+        if not number.isdecimal():
+            continue
+        dead = not alive(int(number)) if host == _host() else not shared
+        if dead:
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 

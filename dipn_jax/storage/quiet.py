@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from typing import Any
 
 
-def _is_of_a_waiter(record: logging.LogRecord) -> bool:
-    """Return whether what asyncio reports is no write whose failure nobody has waited for."""
+def _printed(record: logging.LogRecord) -> bool:
+    """Return whether a report of asyncio is printed: all are, except those of failed tasks that nobody waited for."""
     return not record.getMessage().startswith("Task exception was never retrieved")
 
 
@@ -18,9 +18,9 @@ def _is_of_a_waiter(record: logging.LogRecord) -> bool:
 def failing() -> Iterator[None]:
     """Keep Orbax from printing tracebacks of a save that fails, within a `with` statement.
 
-    TensorStore's threads may report to Orbax's event loop after it was closed, and asyncio names the writes that nobody
-    waited for when it forgets them, both also after the failure: so only a save that succeeds lets such reports be
-    printed again.
+    TensorStore's threads may report to Orbax's event loop after it was closed, and asyncio reports failed writes that
+    nobody waited for. Both can happen some time after the failure, so they are printed again only after a save that
+    succeeds.
     """
     absl, tasks, hook = logging.getLogger("absl"), logging.getLogger("asyncio"), sys.unraisablehook
     level = absl.level
@@ -29,12 +29,12 @@ def failing() -> Iterator[None]:
         if str(unraisable.exc_value) != "Event loop is closed":
             hook(unraisable)
 
-    tasks.addFilter(_is_of_a_waiter)
+    tasks.addFilter(_printed)
     absl.setLevel(logging.CRITICAL)
     sys.unraisablehook = report
     try:
         yield
         sys.unraisablehook = hook
-        tasks.removeFilter(_is_of_a_waiter)
+        tasks.removeFilter(_printed)
     finally:
         absl.setLevel(level)
