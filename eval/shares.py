@@ -18,7 +18,10 @@ from dipn_jax.launch import Launch
 from . import options
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from dipn_jax.storage import resume
+    from dipn_jax.storage.arrays import Form
 
 PART = "part.json"
 """Name of the file that makes a folder a part."""
@@ -152,6 +155,32 @@ def read(folder: pathlib.Path) -> Part:
         raise UserError(f"{path}: damaged, {error}; make the part again") from None
     names = {field.name for field in dataclasses.fields(Part)} - {"folder"}
     return Part(folder, **{name: found[name] for name in names} | {"command": tuple(found["command"])})
+
+
+def pooled(parts: Sequence[Part], name: str, forms: Mapping[str, Form], *, by: str) -> dict[str, np.ndarray]:
+    """Return the arrays that all parts hold in their files `name`, joined along the first axis and sorted.
+
+    Args:
+      parts: all of an evaluation.
+      name: of the files.
+      forms: of the arrays.
+      by: name of the array of numbers that they are sorted by.
+
+    Raises:
+      UserError: a part is damaged.
+    """
+    import numpy as np
+
+    from dipn_jax.storage import arrays
+
+    found = []
+    for part in parts:
+        try:
+            found.append(arrays.read(part.path(name), forms))
+        except typed.Misfit as error:
+            raise UserError(f"{part.folder / name}: damaged, {error}; {part.again()}") from None
+    places = np.argsort(np.concatenate([each[by] for each in found]), kind="stable")
+    return {key: np.concatenate([each[key] for each in found])[places] for key in forms}
 
 
 def made(out: pathlib.Path, kind: str, share: Share, partial: resume.Partial, *, quiet: bool = False) -> bool:

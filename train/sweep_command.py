@@ -40,8 +40,8 @@ def sweep(
     The command of a training, without --out and --seed, stands after --:
       dipn-train sweep --seeds 0 1 2 --limits 500 1500 --out runs/curve -- push --data data/push --steps 3000
 
-    Each training is a run of its own, in OUT/LIMIT-SEED or OUT/seed-SEED. The same command goes on where each of them
-    stopped, and leaves those that have ended; seeds and limits may be added.
+    Each training is a run of its own, in OUT/LIMIT-SEED or OUT/seed-SEED. The same command continues those
+    that were stopped and skips those that have ended; seeds and limits may be added.
 
     Args:
       command: push, grasp-pretrain, grasp, grasp-online or baseline, and its options.

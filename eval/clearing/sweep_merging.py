@@ -47,14 +47,7 @@ def _pooled(parts: Sequence[Part], distances: int) -> dict[str, np.ndarray]:
     """
     size = ("B", distances, 2)
     forms = {"scene": Form("iu", ("B",)), "error": Form("f", size), "count": Form("iu", size)}
-    found = []
-    for part in parts:
-        try:
-            found.append(arrays.read(part.path(ERRORS), forms))
-        except typed.Misfit as error:
-            raise UserError(f"{part.folder / ERRORS}: damaged, {error}; {part.again()}") from None
-    places = np.argsort(np.concatenate([each["scene"] for each in found]), kind="stable")
-    return {name: np.concatenate([each[name] for each in found])[places] for name in forms}
+    return shares.pooled(parts, ERRORS, forms, by="scene")
 
 
 def merge(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:

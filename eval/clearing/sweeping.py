@@ -55,27 +55,6 @@ def name(distance: float) -> str:
     return f"{distance:g}"
 
 
-def prediction_errors(
-    predictor: Predictor,
-    engine: Engine,
-    config: SceneConfig,
-    distances: Sequence[float],
-    *,
-    scenes: int,
-    seed: int,
-    longest: float,
-) -> dict[str, float]:
-    """Measure true 1-IoU of predicted masks after one push per scene, the same pushes at every distance.
-
-    Args: as of `measured`.
-
-    Returns:
-      What `error_rates` makes of them.
-    """
-    found = measured(predictor, engine, config, distances, scenes=scenes, seed=seed, longest=longest)
-    return error_rates(found, [name(distance) for distance in distances])
-
-
 def measured(
     predictor: Predictor,
     engine: Engine,

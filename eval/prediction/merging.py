@@ -13,7 +13,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
 from dipn_jax.storage.arrays import Form
 
-from .. import curves, drawing
+from .. import curves, drawing, shares
 from ..shares import PART, Part
 from . import push_errors
 from .push_errors import DISTANCES
@@ -48,14 +48,7 @@ def pooled(parts: Sequence[Part], names: Sequence[str]) -> dict[str, np.ndarray]
     Raises:
       UserError: a part is damaged.
     """
-    found = []
-    for part in parts:
-        try:
-            found.append(arrays.read(part.path(ERRORS), {name: _form(name) for name in names}))
-        except typed.Misfit as error:
-            raise UserError(f"{part.folder / ERRORS}: damaged, {error}; {part.again()}") from None
-    places = np.argsort(np.concatenate([each["group"] for each in found]), kind="stable")
-    return {name: np.concatenate([each[name] for each in found])[places] for name in names}
+    return shares.pooled(parts, ERRORS, {name: _form(name) for name in names}, by="group")
 
 
 def merge(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def _commands(engine: Any, out: pathlib.Path) -> dict[str, Callable[[], Any]]:
         "grasp": lambda: success.evaluate(nothing, engine, CONFIG, partial, **count),
         "grasp, single objects": lambda: success.label_agreement(engine, CONFIG, **count),
         "clear": lambda: Tables("random", objects="3", instances=EACH).make(engine, seed=SEED),
-        "sweep": lambda: sweeping.prediction_errors(nothing, engine, CONFIG, (0.1,), **count, longest=0.1),
+        "sweep": lambda: sweeping.measured(nothing, engine, CONFIG, (0.1,), **count, longest=0.1),
     }
 
 

@@ -171,9 +171,8 @@ def test_a_sweep_continues_at_the_distance_where_it_was_stopped(
 
 def test_a_longer_push_is_harder_to_predict(engine: Any) -> None:
     config = scenes.fixed_count(3, spread=0.2)
-    values = sweeping.prediction_errors(
-        predictors.static_predictor, engine, config, (0.03, 0.12), scenes=6, seed=0, longest=0.12
-    )
+    found = sweeping.measured(predictors.static_predictor, engine, config, (0.03, 0.12), scenes=6, seed=0, longest=0.12)
+    values = sweeping.error_rates(found, ["0.03", "0.12"])
     near, far = (values[f"sweep/{name}/push_error/all"] for name in ("0.03", "0.12"))
     assert 0 <= near < far <= 1
     figures = {f"sweep/{name}/completion": 1.0 for name in ("0.03", "0.12", "chosen")}
