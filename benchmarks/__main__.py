@@ -8,8 +8,9 @@ import sys
 from collections.abc import Sequence
 
 from benchmarks.harness import Benchmark, Figures, Setting, Skipped, machine
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 
 BENCHMARKS = {
     "datagen_native.share_of_bare": Benchmark(

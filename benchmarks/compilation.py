@@ -25,7 +25,7 @@ def first_calls() -> float:
     import jax
     import numpy as np
 
-    from dipn_jax import console
+    from dipn_jax.commands import console
     from dipn_jax.physics import make_engine
     from dipn_jax.planning import candidates
     from dipn_jax.world import primitives, scenes

@@ -7,8 +7,9 @@ import pathlib
 import platform
 from typing import Any
 
-from dipn_jax import console, files, machine, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, machine, typed
 
 MEASURED = "measured"
 """See `gpu_stage.MEASURED`, whose import would import JAX."""

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import machine
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.world import scenes
 
 MEASURED = "measured"

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from dipn_jax.datagen import generate
 
-from dipn_jax import files
-from dipn_jax.machine import commit, cores, processor
+from dipn_jax.system import files
+from dipn_jax.system.machine import commit, cores, processor
 
 Figures = dict[str, float]
 Scale = Literal["small", "full"]

@@ -18,8 +18,8 @@ from dipn_jax.datagen import generate, spread
 from dipn_jax.datagen.generate import Job
 
 from benchmarks.harness import Setting, Skipped, quiet, seconds
-from dipn_jax import launch
-from dipn_jax.launch import Launch
+from dipn_jax.commands import launch
+from dipn_jax.commands.launch import Launch
 from dipn_jax.world import scenes
 
 JOB = Job(kind="push", scene=scenes.fixed_count(1), episodes=1, seed=0, shard_size=1, actions=1, engine="native")

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from benchmarks.gpu_process import Worker
 from benchmarks.gpu_record import Record, Stage
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 
 STAGES = {

@@ -10,7 +10,8 @@ from typing import Any
 from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
 from benchmarks.harness import Figures
-from dipn_jax import console, files
+from dipn_jax.commands import console
+from dipn_jax.system import files
 
 SETTINGS = "datagen_mjx.settings"
 """The benchmark of other settings of MJX."""

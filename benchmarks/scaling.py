@@ -7,7 +7,8 @@ import sys
 from typing import Any
 
 from benchmarks.page import origins
-from dipn_jax import console, files
+from dipn_jax.commands import console
+from dipn_jax.system import files
 
 MILLION = 1_000_000
 """Episodes that a cost is given for."""

@@ -68,7 +68,7 @@ def torch_device() -> Any:
     """
     import torch
 
-    from dipn_jax.machine import cores
+    from dipn_jax.system.machine import cores
 
     torch.set_num_threads(cores())
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -12,10 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dipn_jax import addresses, console, files, pages, structs, typed
+from dipn_jax import structs
+from dipn_jax.commands import console, pages
 from dipn_jax.sight import render
 from dipn_jax.storage import accounting, records, shards
 from dipn_jax.structs import ABSENT, Fault
+from dipn_jax.system import addresses, files, typed
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 

@@ -12,13 +12,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import batching, console, files, seeds, typed
+from dipn_jax import batching, seeds
+from dipn_jax.commands import console
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
 from dipn_jax.seeds import Purpose
 from dipn_jax.storage import owner
 from dipn_jax.structs import Fault
+from dipn_jax.system import files, typed
 from dipn_jax.world import shapes
 
 from . import world

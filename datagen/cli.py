@@ -8,11 +8,11 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from dipn_jax import command_words, console
-from dipn_jax.addresses import Place
+from dipn_jax.commands import command_line, console
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import EngineName
+from dipn_jax.system.addresses import Place
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
 from . import upkeep
@@ -58,7 +58,7 @@ def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *,
     """Generate what `job` says; `given` are the options that the command was called with, to be kept."""
     from .generate import generate
 
-    command = command_words.words(COMMANDS[job.kind], given, without=command_words.WORKER_OPTIONS)
+    command = command_line.words(COMMANDS[job.kind], given, without=command_line.WORKER_OPTIONS)
     elsewhere = None
     if work.launch.spreads:
         from . import spread

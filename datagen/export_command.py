@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from dipn_jax import addresses
-from dipn_jax.addresses import Place
+from dipn_jax.system import addresses
+from dipn_jax.system.addresses import Place
 
 Format = Literal["parquet", "npz", "hdf5", "zarr", "lerobot"]
 """Format of an export."""

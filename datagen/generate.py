@@ -19,7 +19,8 @@ from typing import Any
 
 import jax
 
-from dipn_jax import console, files, seeds, structs, typed
+from dipn_jax import seeds, structs
+from dipn_jax.commands import console
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
@@ -28,6 +29,7 @@ from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
 from dipn_jax.storage import accounting, places, shards
 from dipn_jax.storage.places import Place
+from dipn_jax.system import files, typed
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 

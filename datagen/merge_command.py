@@ -6,9 +6,10 @@ import pathlib
 
 import tyro
 
-from dipn_jax import addresses, console
-from dipn_jax.addresses import Place
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import addresses
+from dipn_jax.system.addresses import Place
 
 
 def merge(folders: tyro.conf.Positional[tuple[Place, ...]], out: pathlib.Path | None = None) -> None:

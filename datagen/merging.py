@@ -9,9 +9,10 @@ import shutil
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import console, files, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, manifest, owner, records, shards
+from dipn_jax.system import files, typed
 
 MOST_SAID = 400
 """Characters of what differs between two data sets that are shown at most."""

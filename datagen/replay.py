@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import console, machine, structs
+from dipn_jax import structs
+from dipn_jax.commands import console
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine
 from dipn_jax.storage import codec, records, shards
 from dipn_jax.structs import Fault, PushEpisode
+from dipn_jax.system import machine
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import primitives
 

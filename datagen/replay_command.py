@@ -6,10 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from dipn_jax import console
-from dipn_jax.addresses import Place
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
+from dipn_jax.system.addresses import Place
 
 
 def replay(

@@ -7,10 +7,10 @@ import pathlib
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from dipn_jax import launch
+from dipn_jax.commands import launch
+from dipn_jax.commands.launch import Launch
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
-from dipn_jax.launch import Launch
 from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import scorers

@@ -7,9 +7,10 @@ import pathlib
 
 import tyro
 
-from dipn_jax import addresses, command_paths, console
-from dipn_jax.addresses import Place
+from dipn_jax.commands import console, option_paths
 from dipn_jax.errors import UserError
+from dipn_jax.system import addresses
+from dipn_jax.system.addresses import Place
 
 MOST_SHOWN = 2000
 """Episodes on a page at most: about 10 MB."""
@@ -81,7 +82,7 @@ def info(
     console.require_between(1, MOST_SHOWN, sample=sample)
     console.require_seed(seed)
     if html is not None:
-        command_paths.require_file(html, ".html", ".htm", option="html")
+        option_paths.require_file(html, ".html", ".htm", option="html")
     folder = mirror.local(folder)
     summary = records.summary(folder)
     if html is not None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import forking
+from dipn_jax.system import forking
 
 BATCH = 64
 """Rows that a compiled function takes at a time."""

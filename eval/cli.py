@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from dipn_jax import console
+from dipn_jax.commands import console
 
 from . import merging
 from .clearing import command as clearing

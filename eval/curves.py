@@ -9,10 +9,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DIPN
 from dipn_jax.storage import checkpoint
+from dipn_jax.system import files, typed
 
 from .prediction.push_errors import DISTANCES
 

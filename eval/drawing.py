@@ -13,7 +13,8 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import files, pages
+from dipn_jax.commands import pages
+from dipn_jax.system import files
 from dipn_jax.workspace import WORKSPACE
 
 

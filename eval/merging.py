@@ -8,9 +8,10 @@ from typing import Any
 
 import tyro
 
-from dipn_jax import console, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting
+from dipn_jax.system import typed
 
 from . import options, shares
 from .shares import Part

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import files
+from dipn_jax.system import files
 
 RESAMPLES = 2000
 """Number of bootstrap resamples."""

@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Any
 
-from dipn_jax import console
+from dipn_jax.commands import console
 
 if TYPE_CHECKING:
     from dipn_jax.storage import resume

@@ -11,9 +11,10 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from dipn_jax import console, files, machine, typed
+from dipn_jax.commands import console
+from dipn_jax.commands.launch import Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import Launch
+from dipn_jax.system import files, machine, typed
 
 from . import options
 

@@ -8,8 +8,9 @@ import shutil
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from dipn_jax import console, files, launch, temporary
-from dipn_jax.launch import LOCAL, Launch
+from dipn_jax.commands import console, launch
+from dipn_jax.commands.launch import LOCAL, Launch
+from dipn_jax.system import files, temporary
 
 from . import merging, options, shares
 from .shares import PART, Share

@@ -14,7 +14,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 
-from dipn_jax import files
+from dipn_jax.system import files
 from experiments import clearing_tables, command, grasping, pages
 from experiments.kept import Kept
 from experiments.runs import Part, Recipe, Run

@@ -6,7 +6,7 @@ import argparse
 import pathlib
 from collections.abc import Callable, Sequence
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from experiments import kept, runs
 from experiments.runs import Run
 

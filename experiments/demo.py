@@ -14,8 +14,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 from experiments import command, pages
 from experiments.runs import Recipe, Run
 

@@ -19,8 +19,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import console, files, machine
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, machine
 from experiments import faults_run, pages, reliability
 from experiments.faults_run import Case, Kind, Point
 from experiments.mutants_session import ROOT, STAGES

@@ -18,9 +18,10 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from dipn_jax import files, structs
+from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.storage import checkpoint, records
+from dipn_jax.system import files
 from experiments.runs import PROGRAMS
 
 FILTER = "--seccomp-bpf"

@@ -25,8 +25,9 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import console, files, machine
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, machine
 from experiments import fuzz_parsers, pages
 from experiments.fuzz_parsers import Parser
 

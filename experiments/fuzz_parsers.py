@@ -17,11 +17,12 @@ from dipn_jax.eval.clearing import film
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.report import comparison
 
-from dipn_jax import files, structs
+from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, checkpoint, records, resume, shards
 from dipn_jax.storage.manifest import MANIFEST, update_manifest
 from dipn_jax.structs import Grasp, GraspEpisode, Push, PushEpisode, Scene, SettledScene
+from dipn_jax.system import files
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import cases
 from experiments import fuzzing, runs

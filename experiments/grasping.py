@@ -18,7 +18,7 @@ from typing import Any
 
 from dipn_jax.eval import curves
 
-from dipn_jax import files
+from dipn_jax.system import files
 from experiments import command, pages
 from experiments.runs import Recipe, Run
 

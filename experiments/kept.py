@@ -13,7 +13,7 @@ from typing import Any
 
 from dipn_jax.eval.clearing.lockstep import Outcome
 
-from dipn_jax import files
+from dipn_jax.system import files
 from experiments import runs
 from experiments.runs import Run
 

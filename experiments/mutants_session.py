@@ -15,8 +15,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import files, machine
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, machine
 
 ROOT = pathlib.Path(__file__).parent.parent
 """The folder of this checkout."""

@@ -7,8 +7,9 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 from experiments import runs
 from experiments.runs import NOT_RECORDED, Run
 

@@ -24,7 +24,7 @@ from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.clearing.on_tables import Recall, TablePolicy
 from dipn_jax.eval.clearing.tables import Tables
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.engine import Engine
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import outlook, scorers
@@ -33,6 +33,7 @@ from dipn_jax.planning.methods import Networks, PolicyConfig
 from dipn_jax.sight import render
 from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import Array, Decision, Observation, Scene
+from dipn_jax.system import files
 from dipn_jax.world.ranges import Ranges
 from experiments import pages
 

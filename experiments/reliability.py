@@ -18,8 +18,9 @@ import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 from experiments import pages
 
 PAGE = "reliability"
@@ -74,7 +75,7 @@ PROMISES = (
         "A file or step under its final name is complete, even after a power cut: its content is synced, then it is "
         "renamed, then the folder is synced.",
         (
-            "tests/dipn_jax/test_files.py::test_content_is_synced_before_a_rename_and_the_name_after_it",
+            "tests/dipn_jax/system/test_files.py::test_content_is_synced_before_a_rename_and_the_name_after_it",
             "tests/test_house.py::test_files_are_renamed_in_one_place",
             f"{_STORAGE}/test_saving.py::test_a_step_has_its_name_only_when_it_is_synced",
         ),
@@ -116,7 +117,7 @@ PROMISES = (
         "A damaged or malformed file from the user gives one line and exit code 2, not a traceback.",
         (
             "tests/test_commands.py::test_an_unknown_shape_in_a_case_file",
-            "tests/dipn_jax/test_files.py::test_a_file_that_is_no_utf8_is_damaged",
+            "tests/dipn_jax/system/test_files.py::test_a_file_that_is_no_utf8_is_damaged",
         ),
         _fuzz,
     ),
@@ -290,8 +291,7 @@ def _work(options: argparse.Namespace) -> int:
         return 0
     with tempfile.TemporaryDirectory() as folder:
         two_steps(pathlib.Path(folder))
-        found = damage(pathlib.Path(folder))
-    write("checkpoints", found)
+        write("checkpoints", found := damage(pathlib.Path(folder)))
     console.say(f"checkpoints: {found['recovered']} of {found['damaged']}")
     return 0
 

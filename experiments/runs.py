@@ -15,8 +15,9 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from dipn_jax import console, files, machine, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, machine, typed
 
 PROGRAMS = {
     "dipn-datagen": "dipn_jax.datagen.cli",

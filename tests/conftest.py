@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from dipn_jax.datagen.generate import Job, generate
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.physics import make_engine
 from dipn_jax.world import clutter, scenes
 

@@ -16,7 +16,7 @@ from dipn_jax.eval import options
 from dipn_jax.train import cli as train_cli
 from flax import nnx
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import checkpoint, shards
 
@@ -198,7 +198,7 @@ def test_the_list_of_commands_has_a_sentence_for_each(stage: str, capfd: pytest.
 @pytest.mark.parametrize("stage", COMMANDS)
 def test_help_imports_nothing_that_is_slow(stage: str) -> None:
     script = (
-        f"import sys; from dipn_jax.{stage}.cli import COMMANDS; from dipn_jax import console\n"
+        f"import sys; from dipn_jax.{stage}.cli import COMMANDS; from dipn_jax.commands import console\n"
         "for arguments in [['--help'], *[[name, '--help'] for name in COMMANDS]]:\n"
         "    try: console.run('test', COMMANDS, arguments)\n"
         "    except SystemExit: pass\n"

@@ -19,8 +19,9 @@ from dipn_jax.eval.report import paper
 
 from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.sight import render
+from dipn_jax.system import files
 from experiments import moving_picture, runs, tutorial_pictures
 
 ROOT = pathlib.Path(__file__).parent.parent

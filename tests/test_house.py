@@ -21,9 +21,8 @@ MOST_LINES = 300
 """Largest number of lines in a file."""
 # library modules in the order of the arrows: each may import only what stands before it
 ORDER = [
-    "errors", "names", "command_words", "seeds", "typed", "interruption", "forking", "addresses", "temporary",
-    "files", "command_paths", "console", "pages", "machine", "launch", "structs", "workspace", "geometry", "batching",
-    "engine", "world", "physics", "sight", "networks", "storage", "planning",
+    "errors", "names", "seeds", "system", "commands", "structs", "workspace", "geometry", "batching", "engine", "world",
+    "physics", "sight", "networks", "storage", "planning",
 ]  # fmt: skip
 
 
@@ -174,7 +173,7 @@ def test_text_files_are_read_and_written_as_utf8() -> None:
 
 def test_bytes_are_read_in_one_place() -> None:
     """`files.read_bytes` refuses what is no regular file, such as a pipe, which could be read for ever."""
-    allowed = {ROOT / "dipn_jax" / "files.py", ROOT / "dipn_jax" / "storage" / "owner.py"}
+    allowed = {ROOT / "dipn_jax" / "system" / "files.py", ROOT / "dipn_jax" / "storage" / "owner.py"}
     for package in PACKAGES:
         for path in {*(ROOT / package).rglob("*.py")} - allowed:
             assert not [name for name, _ in _calls(path) if re.search(r"(?<!^files)\.read_bytes$", name)], path
@@ -211,7 +210,7 @@ def test_files_are_renamed_in_one_place() -> None:
         for path in (ROOT / package).rglob("*.py"):
             called = {name for name, _ in _calls(path)}
             renaming = {name for name in called if name.endswith(".rename") or name in ("os.replace", "shutil.move")}
-            assert not renaming or path == ROOT / "dipn_jax" / "files.py", f"{path}: {renaming}"
+            assert not renaming or path == ROOT / "dipn_jax" / "system" / "files.py", f"{path}: {renaming}"
 
 
 def test_figures_of_evaluations_are_written_whole() -> None:

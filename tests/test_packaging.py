@@ -86,6 +86,10 @@ def test_the_wheel_holds_one_package_with_its_data(wheel: pathlib.Path, installe
     top = {name.split("/")[0] for name in names}
     assert top == {"dipn_jax", next(name for name in top if name.endswith(".dist-info"))}
     assert {"dipn_jax/data/hard_cases.json", "dipn_jax/py.typed", "dipn_jax/eval/clearing/command.py"} <= set(names)
+    for folder in (ROOT / "dipn_jax", *(ROOT / stage for stage in STAGES)):
+        inside = "dipn_jax" if folder.name == "dipn_jax" else f"dipn_jax/{folder.name}"
+        modules = {f"{inside}/{path.relative_to(folder)}" for path in folder.rglob("*.py")}
+        assert modules <= set(names), modules - set(names)
     assert {f"dipn_jax/physics/{path.name}" for path in (ROOT / "dipn_jax" / "physics").glob("*.h")} <= set(names)
     script = (
         "import dipn_jax, pathlib; from dipn_jax.world.cases import hard_cases_path, load_cases; "

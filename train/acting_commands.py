@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 

@@ -7,7 +7,8 @@ import signal
 import sys
 import threading
 
-from dipn_jax import console, typed
+from dipn_jax.commands import console
+from dipn_jax.system import typed
 
 from . import cli
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import files, seeds, structs
+from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses
@@ -26,6 +26,7 @@ from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
 from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Grasp, GraspEpisode
+from dipn_jax.system import files
 from dipn_jax.world.scenes import SceneConfig
 
 from . import acting, finite, tables

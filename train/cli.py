@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dipn_jax import console
-from dipn_jax.addresses import Place
+from dipn_jax.commands import console
+from dipn_jax.system.addresses import Place
 
 from .acting_commands import baseline, grasp_online, say
 from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig, check

@@ -9,7 +9,7 @@ from typing import Literal
 
 import tyro
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 
 Preset = Literal["compact", "paper"]

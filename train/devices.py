@@ -13,8 +13,9 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from dipn_jax import console, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import typed
 
 from .configs import Compute
 

@@ -12,7 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import batching, console, files, structs
+from dipn_jax import batching, structs
+from dipn_jax.commands import console
+from dipn_jax.system import files
 
 _LARGEST = 1e6
 """Bytes that an example takes at most: tenfold those of a push of thirty objects."""

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import batching, console, geometry, structs
+from dipn_jax import batching, geometry, structs
+from dipn_jax.commands import console
 from dipn_jax.networks import grasp, losses
 from dipn_jax.sight import fingers, render
 from dipn_jax.storage import plain

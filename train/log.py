@@ -10,7 +10,7 @@ import time
 import jax
 import tensorboardX
 
-from dipn_jax import files, typed
+from dipn_jax.system import files, typed
 
 try:
     import resource

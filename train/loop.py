@@ -15,10 +15,12 @@ import numpy as np
 import optax
 from flax import nnx
 
-from dipn_jax import console, files, seeds
+from dipn_jax import seeds
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
-from dipn_jax.interruption import Interruption
 from dipn_jax.storage import checkpoint, owner, saving
+from dipn_jax.system import files
+from dipn_jax.system.interruption import Interruption
 
 from . import devices, finite, log, order, precision, profiling
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from flax import nnx
 
-from dipn_jax import files, seeds, structs
+from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspNet, score_image
@@ -22,6 +22,7 @@ from dipn_jax.seeds import Purpose
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint, plain
 from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
+from dipn_jax.system import files
 from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
 

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import batching, console, geometry, structs
+from dipn_jax import batching, geometry, structs
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, losses, push_frame
 from dipn_jax.networks.push_frame import PushInput, View

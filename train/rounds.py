@@ -11,8 +11,9 @@ from typing import Any, ClassVar, Protocol, Self, TypeVar
 import jax
 from flax import nnx
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.storage import checkpoint, owner, resume
+from dipn_jax.system import files
 
 
 class State(Protocol):

@@ -13,9 +13,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from dipn_jax import command_words, console, files, typed
+from dipn_jax.commands import command_line, console
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import LOCAL, Launch
+from dipn_jax.system import files, typed
 
 from .sweeping import Training
 
@@ -142,7 +143,7 @@ def _record(out: pathlib.Path, trainings: Sequence[Training]) -> dict[str, Any]:
 
     first = trainings[0]
     commands: dict[str, Any] = cli.COMMANDS
-    command = [first.kind, *command_words.words(commands[first.kind], first.given, without=_FREE)]
+    command = [first.kind, *command_line.words(commands[first.kind], first.given, without=_FREE)]
     path = out / RECORD
     record: dict[str, Any] = {"command": command, "trainings": {}}
     record = files.read_json(path, wanted=_FORM) if path.exists() else record

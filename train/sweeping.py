@@ -12,9 +12,10 @@ import threading
 from collections.abc import Generator, Iterable, Sequence
 from typing import Any
 
-from dipn_jax import command_words, console, files, launch
+from dipn_jax.commands import command_line, console, launch
+from dipn_jax.commands.launch import RETRIES, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import RETRIES, Launch
+from dipn_jax.system import files
 
 Values = dict[str, float]
 """What a run measured last."""
@@ -37,7 +38,7 @@ class Training:
         from . import cli
 
         commands: dict[str, Any] = cli.COMMANDS
-        return [self.kind, *command_words.words(commands[self.kind], self.given)]
+        return [self.kind, *command_line.words(commands[self.kind], self.given)]
 
 
 def check(trainings: Iterable[Training]) -> None:

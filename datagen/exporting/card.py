@@ -8,9 +8,9 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, records
+from dipn_jax.system import files, typed
 
 from . import steps
 from .columns import Column, of_episodes

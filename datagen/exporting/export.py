@@ -12,9 +12,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dipn_jax import console, files, structs, temporary
+from dipn_jax import structs
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import manifest, owner, records
+from dipn_jax.system import files, temporary
 
 from . import columns, drawn, steps
 from .card import card

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dipn_jax import files
+from dipn_jax.system import files
 
 from . import moments, steps
 from .columns import PIXELS, Values

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import structs, typed
+from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.storage import held_out, records, shards
+from dipn_jax.system import typed
 
 SPLITS = ("train", "test")
 """Names of what is learnt from and what is held out."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import files
+from dipn_jax.system import files
 
 from . import steps
 from .columns import Column, Values

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dipn_jax import files, temporary
+from dipn_jax.system import files, temporary
 
 from .columns import Column, Values
 from .source import Part

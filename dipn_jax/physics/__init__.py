@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 from dipn_jax.engine import Engine, PhysicsConfig
 from dipn_jax.errors import UserError
-from dipn_jax.machine import cores
 from dipn_jax.names import EngineName
 from dipn_jax.structs import Array
+from dipn_jax.system.machine import cores
 
 CONTROL_PERIOD = 0.01
 """Seconds between set points, and between looks for faults."""

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jax import export
 
-from dipn_jax import files
 from dipn_jax.structs import Array
+from dipn_jax.system import files
 
 _CODE_AT_IMPORT = files.code_digest()
 """Digest of the sources, taken while they are imported: editing them later does not change what this process traces."""

@@ -14,7 +14,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float, Int, Key
 
-from dipn_jax import forking
 from dipn_jax.errors import UserError
 from dipn_jax.names import ALL_AIDS, Aid, MethodName
 from dipn_jax.networks import vpg
@@ -24,6 +23,7 @@ from dipn_jax.planning.planner import Predictor, Rule, Scorer, ScoreSummary
 from dipn_jax.sight import observed
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Decision, Observation
+from dipn_jax.system import forking
 
 NetworkRole = Literal["push", "grasp", "value"]
 ROLES: dict[NetworkRole, tuple[str, str]] = {

@@ -9,9 +9,9 @@ from typing import Any, TypeVar, cast
 import jax
 import numpy as np
 
-from dipn_jax import forking
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Observation
+from dipn_jax.system import forking
 from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 
 F = TypeVar("F", bound=Callable[..., Any])

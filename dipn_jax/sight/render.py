@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from dipn_jax import batching, forking, geometry
+from dipn_jax import batching, geometry
 from dipn_jax.structs import ABSENT, Array, Observation, Scene
+from dipn_jax.system import forking
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 

@@ -13,7 +13,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dipn_jax import files, typed
+from dipn_jax.system import files, typed
 
 ASKED = "asked.json"
 """Name of the file with the command that makes a data set."""

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dipn_jax import files, typed
+from dipn_jax.system import files, typed
 
 
 @dataclasses.dataclass(frozen=True)

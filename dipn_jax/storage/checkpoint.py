@@ -21,10 +21,11 @@ import numpy as np
 import orbax.checkpoint as ocp
 from flax import nnx
 
-from dipn_jax import console, files, forking, temporary, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, grasp, vpg
 from dipn_jax.storage import leaves, owner, quiet, stored_step
+from dipn_jax.system import files, forking, temporary, typed
 
 WANTED = (
     "give a run (the --out of dipn-train), one step of it (RUN@STEP, RUN@best) or that step's folder "

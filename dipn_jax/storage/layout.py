@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from dipn_jax import structs, typed
+from dipn_jax import structs
 from dipn_jax.storage import codec
+from dipn_jax.system import typed
 
 KINDS: dict[str, type] = {
     "push": structs.PushEpisode,

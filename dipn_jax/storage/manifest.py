@@ -12,9 +12,10 @@ import pathlib
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from dipn_jax import console, files, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import layout, shards
+from dipn_jax.system import files, typed
 
 try:
     import fcntl

@@ -9,11 +9,12 @@ import hashlib
 import pathlib
 from collections.abc import Iterator, Mapping
 
-from dipn_jax import addresses, console, files, temporary, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage.accounting import ASKED
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.storage.objects import Bucket, Found
+from dipn_jax.system import addresses, files, temporary, typed
 
 try:
     import fcntl

@@ -12,8 +12,8 @@ import urllib.parse
 from collections.abc import Iterator
 from typing import Any
 
-from dipn_jax import typed
 from dipn_jax.errors import UserError
+from dipn_jax.system import typed
 
 SETTINGS = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_REGION; elsewhere than at Amazon AWS_ENDPOINT, too",

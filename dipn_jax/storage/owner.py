@@ -10,8 +10,9 @@ import pathlib
 import socket
 from collections.abc import Iterator
 
-from dipn_jax import console, temporary, typed
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import temporary, typed
 
 try:
     import fcntl

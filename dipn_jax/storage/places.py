@@ -13,10 +13,11 @@ import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
-from dipn_jax import addresses, console, files, temporary
+from dipn_jax.commands import console
 from dipn_jax.storage import accounting, manifest, mirror, records, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.storage.objects import Bucket
+from dipn_jax.system import addresses, files, temporary
 
 SILENT_SHARDS = 20
 """Number of shards below which no progress is shown while they are looked at."""

@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from dipn_jax import console, files, machine
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, manifest, mirror, shards
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
+from dipn_jax.system import files, machine
 
 PROGRESS_SHARDS = 100
 """Number of shards from which on progress is shown while they are read."""

@@ -8,8 +8,9 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.storage import checkpoint, plain
+from dipn_jax.system import files
 
 FORMAT_VERSION = 1
 """Version of the format; a state of another version is not taken up."""

@@ -10,7 +10,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import checkpoint, leaves
 

@@ -20,10 +20,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dipn_jax import files, machine, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import codec, layout
 from dipn_jax.storage.layout import KINDS
+from dipn_jax.system import files, machine, typed
 
 SCHEMA_VERSION = 3
 """Version of the format that is written."""

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from dipn_jax import typed
 from dipn_jax.errors import UserError
+from dipn_jax.system import typed
 
 FORM = {
     "format_version": int,

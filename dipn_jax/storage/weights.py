@@ -10,9 +10,10 @@ import numpy as np
 import safetensors.numpy
 from flax import nnx
 
-from dipn_jax import command_paths, files
+from dipn_jax.commands import option_paths
 from dipn_jax.networks import described
 from dipn_jax.storage import checkpoint
+from dipn_jax.system import files
 
 FORMAT = "dipn-jax weights 1"
 """Entry `format` of the file's metadata."""
@@ -38,7 +39,7 @@ def write(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
     Raises:
       UserError: as `checkpoint.load_network`; or `out` cannot be a file.
     """
-    command_paths.require_file(out, ".safetensors", option="out")
+    option_paths.require_file(out, ".safetensors", option="out")
     model: Any = checkpoint.load_network(run, network=network)
     where = checkpoint.find(pathlib.Path(run), network=network)
     folder, meta = checkpoint.newest(where)  # type: ignore[misc]

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dipn_jax import files, geometry, typed
+from dipn_jax import geometry
 from dipn_jax.errors import UserError
 from dipn_jax.structs import ABSENT, Scene
+from dipn_jax.system import files, typed
 from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 from dipn_jax.world import scenes, shapes
 

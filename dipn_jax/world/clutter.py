@@ -8,10 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Key
 
-from dipn_jax import batching, forking, structs
+from dipn_jax import batching, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.structs import Array, Fault, Grasp, Scene, SettledScene
+from dipn_jax.system import forking
 from dipn_jax.world import primitives, scenes
 
 MAX_DROPS = 128

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dipn_jax import forking, geometry
+from dipn_jax import geometry
 from dipn_jax.engine import Engine
 from dipn_jax.structs import Array, Fault, Grasp, Outcome, Push, Rollout, Scene, Trajectory
+from dipn_jax.system import forking
 from dipn_jax.workspace import GRIPPER, PUSH_STEPS
 
 CLEAR_HEIGHT = 0.30

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from dipn_jax import command_words
-from dipn_jax.launch import LOCAL, Launch
+from dipn_jax.commands import command_line
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName, MethodName
 
 from ..shares import WHOLE, Share
@@ -110,5 +110,5 @@ def clear(
         longest=longest,
         remember=remember,
         share=share,
-        command=command_words.words(clear, asked, without=command_words.WORKER_OPTIONS),
+        command=command_line.words(clear, asked, without=command_line.WORKER_OPTIONS),
     )

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.sight import imagine, masks, render
 from dipn_jax.storage import arrays
 from dipn_jax.structs import Array, Scene
+from dipn_jax.system import files, typed
 from dipn_jax.workspace import WORKSPACE
 
 from .instances import Instance

@@ -13,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from dipn_jax import console, files, seeds, structs
+from dipn_jax import seeds, structs
+from dipn_jax.commands import console
 from dipn_jax.engine import Engine
 from dipn_jax.storage import resume
 from dipn_jax.structs import Array, Decision, Fault
+from dipn_jax.system import files
 from dipn_jax.workspace import PUSH_STEPS, WORKSPACE
 from dipn_jax.world import clutter, primitives
 

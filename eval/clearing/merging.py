@@ -6,8 +6,8 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax import files, typed
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, typed
 
 from ..shares import Part
 from . import lockstep

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from dipn_jax import command_words, console
+from dipn_jax.commands import command_line, console
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName
 
 from .. import options, shares
@@ -97,7 +97,7 @@ def sweep(
     if launch.spreads:
         spread.spread("sweep", asked, kept)
         return
-    command = command_words.words(sweep, asked, without=command_words.WORKER_OPTIONS)
+    command = command_line.words(sweep, asked, without=command_line.WORKER_OPTIONS)
     with owner.owned(out):
         if shares.made(out, "sweep", share, kept):
             return

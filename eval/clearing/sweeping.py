@@ -13,7 +13,8 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import batching, console, geometry, pages, seeds, structs
+from dipn_jax import batching, geometry, seeds, structs
+from dipn_jax.commands import console, pages
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.networks import losses

@@ -6,8 +6,9 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from dipn_jax import command_words, console
+from dipn_jax.commands import command_line, console
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
@@ -113,7 +113,7 @@ def grasp(
                     "grasp",
                     share,
                     total=scenes_,
-                    command=command_words.words(grasp, asked, without=command_words.WORKER_OPTIONS),
+                    command=command_line.words(grasp, asked, without=command_line.WORKER_OPTIONS),
                     given=settings,
                     partial=partial,
                     names=[*names, merging.TRIED],

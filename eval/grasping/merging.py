@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
+from dipn_jax.system import files, typed
 
 from .. import curves, drawing
 from ..clearing import merging as clearing

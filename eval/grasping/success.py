@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dipn_jax import batching, console, seeds, structs
+from dipn_jax import batching, seeds, structs
+from dipn_jax.commands import console
 from dipn_jax.engine import Engine
 from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.planning import candidates, methods

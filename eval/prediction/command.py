@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from dipn_jax import command_words
+from dipn_jax.commands import command_line
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import LOCAL, Launch
 from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
@@ -99,7 +99,7 @@ def predict(
             "prediction",
             share,
             total=push_errors.groups(scenes_),
-            command=command_words.words(predict, asked, without=command_words.WORKER_OPTIONS),
+            command=command_line.words(predict, asked, without=command_line.WORKER_OPTIONS),
             given=settings,
             partial=partial,
             names=merging.save(out, rows, films),

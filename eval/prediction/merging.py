@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from dipn_jax import files, typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
 from dipn_jax.storage.arrays import Form
+from dipn_jax.system import files, typed
 
 from .. import curves, drawing, shares
 from ..shares import PART, Part

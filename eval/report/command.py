@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from dipn_jax import console
+from dipn_jax.commands import console
 
 
 def report(

@@ -9,8 +9,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dipn_jax import files, pages, typed
+from dipn_jax.commands import pages
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, typed
 
 from .. import drawing
 from ..clearing import film, lockstep, merging

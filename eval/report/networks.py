@@ -5,7 +5,8 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Iterator
 
-from dipn_jax import files, pages, typed
+from dipn_jax.commands import pages
+from dipn_jax.system import files, typed
 
 DIGITS = 12
 """Digits of a digest that the report shows; `settings.json` has all of them."""

@@ -12,9 +12,10 @@ import matplotlib
 matplotlib.use("agg")
 import matplotlib.pyplot as plt
 
-from dipn_jax import files, pages, typed
+from dipn_jax.commands import pages
 from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays
+from dipn_jax.system import files, typed
 
 from .. import drawing, metrics
 from ..clearing import sweeping

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from dipn_jax.datagen import cli
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.sight import render
 from dipn_jax.storage import records
 from dipn_jax.structs import Fault
+from dipn_jax.system import files
 from dipn_jax.world import shapes
 
 Data = dict[str, pathlib.Path]

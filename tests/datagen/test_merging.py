@@ -13,9 +13,10 @@ from dipn_jax.datagen.generate import Job, generate
 from dipn_jax.train import split
 from dipn_jax.train.push import PushTask
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.storage import manifest, records, shards
+from dipn_jax.system import files
 from dipn_jax.world import scenes
 
 JOB = Job(

@@ -14,8 +14,8 @@ import pytest
 from dipn_jax.datagen import cli
 from dipn_jax.train import cli as train
 
-from dipn_jax import console, launch
-from dipn_jax.launch import Launch
+from dipn_jax.commands import console, launch
+from dipn_jax.commands.launch import Launch
 from dipn_jax.storage.objects import Bucket
 
 WORDS = ("images", "--objects", "1", "--episodes", "6", "--shard-size", "1", "--engine", "native")
@@ -128,7 +128,7 @@ def test_what_cannot_be_there_is_refused_in_one_line(
 KILLED = """
 import os, signal, sys
 from dipn_jax.datagen import cli
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.storage.objects import Bucket
 create, made = Bucket.create, []
 def creating(self, name, data):

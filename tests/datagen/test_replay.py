@@ -10,9 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 from dipn_jax.datagen import cli, replay
 
-from dipn_jax import console, machine, structs
+from dipn_jax import structs
+from dipn_jax.commands import console
 from dipn_jax.storage import codec, records, shards
 from dipn_jax.storage.manifest import MANIFEST, update_manifest
+from dipn_jax.system import machine
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import pytest
 from dipn_jax.datagen import cli, generate, spread
 from dipn_jax.datagen.generate import Job
 
-from dipn_jax import console, launch
+from dipn_jax.commands import console, launch
+from dipn_jax.commands.launch import Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import Launch
 from dipn_jax.storage import records
 from dipn_jax.world import scenes
 

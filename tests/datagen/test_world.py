@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from dipn_jax.datagen import check, episodes, isolated, world
 
-from dipn_jax import files, geometry
+from dipn_jax import geometry
 from dipn_jax.errors import UserError
 from dipn_jax.storage import owner
+from dipn_jax.system import files
 from dipn_jax.world import shapes
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"

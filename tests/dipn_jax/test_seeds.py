@@ -16,7 +16,8 @@ from dipn_jax.eval.grasping import success
 from dipn_jax.eval.prediction import push_errors
 from dipn_jax.train import baseline, online
 
-from dipn_jax import console, seeds
+from dipn_jax import seeds
+from dipn_jax.commands import console
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import checkpoint, resume
 from dipn_jax.world import clutter, scenes

@@ -6,7 +6,7 @@ import pathlib
 import pytest
 from dipn_jax.eval import cli
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.storage import owner
 
 _FEW = ("--cases", "random", "--objects", "1")

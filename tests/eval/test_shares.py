@@ -14,9 +14,9 @@ from dipn_jax.eval.clearing import lockstep
 from dipn_jax.eval.prediction import push_errors
 from dipn_jax.eval.shares import Share
 
-from dipn_jax import console
+from dipn_jax.commands import console
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import LOCAL, Launch
 
 WORDS = {
     "clear": ("--method", "gn", "--grasp-net", "grasp", "--cases", "random", "--objects", "1:2", "--instances", "3",

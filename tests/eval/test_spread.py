@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from dipn_jax.eval import cli, spread
 
-from dipn_jax import console, launch
-from dipn_jax.launch import Launch
+from dipn_jax.commands import console, launch
+from dipn_jax.commands.launch import Launch
 
 WORDS = ("clear", "--method", "gn", "--cases", "random", "--objects", "1", "--instances", "3", "--aids")
 """A small evaluation."""

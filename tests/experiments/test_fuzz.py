@@ -9,9 +9,9 @@ import hypothesis
 import pytest
 from hypothesis import strategies as st
 
-from dipn_jax import typed
 from dipn_jax.errors import UserError
 from dipn_jax.storage import layout
+from dipn_jax.system import typed
 from experiments import fuzz, fuzz_parsers, fuzzing
 from experiments.fuzz_parsers import PARSERS, Parser
 

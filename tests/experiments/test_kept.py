@@ -7,7 +7,7 @@ import pytest
 from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import lockstep
 
-from dipn_jax import files
+from dipn_jax.system import files
 from experiments import clearing_tables, kept, runs
 from experiments.kept import Kept
 from experiments.runs import Recipe, Run

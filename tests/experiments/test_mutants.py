@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 from experiments import mutants, mutants_session, pages
 
 ROOT = pathlib.Path(__file__).parent.parent.parent

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 from experiments import clearing, clearing_tables, demo, grasping, pages, push_prediction, runs
 
 DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"

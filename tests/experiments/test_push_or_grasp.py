@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from dipn_jax.eval.clearing.instances import Instance
 
-from dipn_jax import files, structs
+from dipn_jax import structs
+from dipn_jax.system import files
 from experiments import pages, push_or_grasp
 
 ROW: dict[str, Any] = {

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from dipn_jax import files
+from dipn_jax.system import files
 from experiments import pages, reliability
 
 ROOT = pathlib.Path(__file__).parent.parent.parent

@@ -9,8 +9,8 @@ import time
 
 import pytest
 
-from dipn_jax import files, machine
 from dipn_jax.errors import UserError
+from dipn_jax.system import files, machine
 from experiments import command, runs
 from experiments.runs import Recipe, Run
 

@@ -9,10 +9,11 @@ import pytest
 from dipn_jax.train import baseline, cli, online
 from flax import nnx
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.storage import checkpoint
+from dipn_jax.system import files
 from dipn_jax.world import scenes
 
 PARTS = {"vpg": (("push", "grasp"), "value"), "rea": (("grasp",), "chance"), "dqn": (("push",), "value")}

@@ -18,16 +18,16 @@ from dipn_jax.train.loop import fit, make_step
 from dipn_jax.train.push import PushTask
 from flax import nnx
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.storage import checkpoint
+from dipn_jax.system import files
 
 CONFIG = DipnConfig(width=8)
 WHOLE = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=100)
 SCRIPT = """
 import pathlib, sys
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.train import devices
 from dipn_jax.train.configs import Compute, TrainConfig

@@ -11,7 +11,8 @@ from dipn_jax.train.example_store import ExampleStore, Kept, Room
 from dipn_jax.train.grasp import GraspTask
 from dipn_jax.train.push import PushTask
 
-from dipn_jax import batching, console
+from dipn_jax import batching
+from dipn_jax.commands import console
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 

@@ -10,11 +10,13 @@ from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.push import PushTask
 from dipn_jax.train.split import load_sides, widened
 
-from dipn_jax import console, files, structs
+from dipn_jax import structs
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import manifest, records, shards
+from dipn_jax.system import files
 
 Data = dict[str, pathlib.Path]
 

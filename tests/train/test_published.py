@@ -15,7 +15,7 @@ from dipn_jax.train.configs import TrainConfig
 from dipn_jax.train.optimizers import make_optimizer, published_rate
 from flax import nnx
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.networks.dipn import DipnConfig
 
 PUBLISHED = TrainConfig(

@@ -16,7 +16,7 @@ from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.loop import TrainConfig, fit
 from dipn_jax.train.push import PushTask
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig

@@ -8,10 +8,11 @@ from dipn_jax.train import cli, online
 from dipn_jax.train.loop import TrainConfig
 from flax import nnx
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import checkpoint
+from dipn_jax.system import files
 from dipn_jax.world import scenes
 
 

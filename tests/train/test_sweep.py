@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 from dipn_jax.train import cli, sweep_command, sweeping
 
-from dipn_jax import console, files, launch
-from dipn_jax.launch import Launch
+from dipn_jax.commands import console, launch
+from dipn_jax.commands.launch import Launch
 from dipn_jax.storage import checkpoint
+from dipn_jax.system import files
 
 PROCESS = """
 import json, os, pathlib, signal, sys, threading, time

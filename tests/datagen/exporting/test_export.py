@@ -12,9 +12,10 @@ from dipn_jax.datagen import cli
 from dipn_jax.datagen.exporting import columns, drawn, export, source
 from dipn_jax.train.split import split
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.sight import render
 from dipn_jax.storage import manifest, records, shards
+from dipn_jax.system import files
 
 FORMATS = ("parquet", "npz", "hdf5", "zarr", "lerobot")
 Data = dict[str, pathlib.Path]

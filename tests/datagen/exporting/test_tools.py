@@ -15,7 +15,7 @@ from dipn_jax.datagen import cli
 from dipn_jax.datagen.exporting import steps
 from dipn_jax.train.split import split
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.sight import render
 from dipn_jax.storage import records
 

@@ -51,7 +51,7 @@ LINES = (
 
 FOUR_DEVICES = """
 import jax, numpy as np
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.world import primitives, scenes
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.native import NativeEngine

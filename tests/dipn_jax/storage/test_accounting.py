@@ -10,10 +10,11 @@ import pyarrow.parquet
 import pytest
 from dipn_jax.datagen import cli, upkeep
 
-from dipn_jax import console, files, machine
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, records, shards
 from dipn_jax.storage.manifest import MANIFEST, update_manifest
+from dipn_jax.system import files, machine
 
 COMMAND = ("push", "--episodes", "24", "--shard-size", "16")
 

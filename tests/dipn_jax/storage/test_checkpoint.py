@@ -10,10 +10,10 @@ import pytest
 from dipn_jax.eval import options
 from flax import nnx
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import checkpoint, owner, resume, stored_step
+from dipn_jax.system import files
 
 CONFIG = GraspConfig(width=8)
 BUILTIN = pathlib.Path("builtin")

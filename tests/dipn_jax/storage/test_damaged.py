@@ -13,7 +13,7 @@ import pytest
 from dipn_jax.datagen import cli as datagen_cli
 from dipn_jax.train.push import PushTask
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.storage import accounting, checkpoint, layout, records, shards

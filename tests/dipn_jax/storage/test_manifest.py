@@ -7,7 +7,7 @@ import shutil
 import pytest
 from dipn_jax.datagen import upkeep
 
-from dipn_jax import console
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import manifest, records, shards
 from dipn_jax.storage.manifest import MANIFEST, update_manifest

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import dipn_jax
-from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import manifest, mirror, records, shards
 from dipn_jax.storage.objects import Bucket
+from dipn_jax.system import files
 
 
 @pytest.fixture

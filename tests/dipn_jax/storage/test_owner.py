@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from dipn_jax.train import log
 
-from dipn_jax import temporary
 from dipn_jax.errors import UserError
 from dipn_jax.storage import owner
+from dipn_jax.system import temporary
 
 HOLD = """
 import pathlib, sys, time

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from dipn_jax import files, temporary
 from dipn_jax.errors import UserError
 from dipn_jax.storage import manifest, mirror, places, records, shards
 from dipn_jax.storage.objects import Bucket
 from dipn_jax.storage.places import Place
+from dipn_jax.system import files, temporary
 
 
 @pytest.fixture

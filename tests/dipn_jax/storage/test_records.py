@@ -9,10 +9,10 @@ import sys
 import numpy as np
 import pytest
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import codec, records, shards
 from dipn_jax.storage.manifest import MANIFEST, update_manifest
+from dipn_jax.system import files
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from dipn_jax.eval.clearing.instances import Instance
 
-from dipn_jax import files
 from dipn_jax.storage import plain
 from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import Scene
+from dipn_jax.system import files
 
 
 class _Malicious:

@@ -14,13 +14,14 @@ from dipn_jax.train import cli
 from flax import nnx
 from safetensors import safe_open
 
-from dipn_jax import console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks import push_frame
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.storage import checkpoint, stored_step, weights
+from dipn_jax.system import files
 
 SHORT = (1, 1, 1, 1)
 CONFIGS = {

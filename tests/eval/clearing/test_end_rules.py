@@ -10,10 +10,10 @@ import pytest
 from dipn_jax.eval.clearing import film, lockstep
 from dipn_jax.eval.clearing.instances import Instance
 
-from dipn_jax import files
 from dipn_jax.planning import planner
 from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import ABSENT, Decision, Fault, Grasp, Observation, Push, Scene
+from dipn_jax.system import files
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import scenes
 

@@ -8,8 +8,8 @@ import pytest
 from dipn_jax.eval.clearing import film
 from dipn_jax.eval.report import comparison
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 from experiments.fuzz_parsers import PARSERS
 
 Arrays = dict[str, np.ndarray]

@@ -7,8 +7,8 @@ import pytest
 from dipn_jax.eval.grasping import merging, rates
 from dipn_jax.eval.shares import Part
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 
 
 def _part(folder: pathlib.Path, shard: int, tables: list[int]) -> Part:

@@ -4,8 +4,8 @@ import re
 import pytest
 from dipn_jax.eval.report import networks, page
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 
 DIGEST = "0123456789abcdef" * 4
 

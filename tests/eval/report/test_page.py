@@ -10,10 +10,10 @@ from dipn_jax.eval import metrics
 from dipn_jax.eval.prediction import push_errors
 from dipn_jax.eval.report import page
 
-from dipn_jax import files
 from dipn_jax.errors import UserError
 from dipn_jax.storage import checkpoint
 from dipn_jax.storage.resume import Partial
+from dipn_jax.system import files
 from dipn_jax.world import scenes
 
 CONFIG = scenes.fixed_count(3, spread=0.2)

@@ -10,16 +10,18 @@ import sys
 
 import pytest
 
-from dipn_jax import files, typed
+import dipn_jax
 from dipn_jax.errors import UserError
 from dipn_jax.storage import arrays, records, shards
 from dipn_jax.storage.manifest import MANIFEST
+from dipn_jax.system import files, typed
 from dipn_jax.world import cases
 
 SCRIPT = """
 import os, pathlib, sys
 from dipn_jax.eval import cli
-from dipn_jax import console, files
+from dipn_jax.commands import console
+from dipn_jax.system import files
 from dipn_jax.world import cases
 
 def named(folder: pathlib.Path) -> None:
@@ -153,7 +155,16 @@ def test_a_file_system_that_syncs_no_folders_is_put_up_with(
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_the_digest_of_the_code_covers_its_kernels(tmp_path: pathlib.Path) -> None:
+def test_the_digest_of_the_code_covers_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    covered: list[pathlib.Path] = []
+    monkeypatch.setattr(files, "read_bytes", lambda path: covered.append(path) or b"")
+    files.code_digest()
+    root = pathlib.Path(dipn_jax.__file__).parent
+    assert {path for kind in ("*.py", "*.h") for path in root.rglob(kind)} == set(covered)
+    assert root / "system" / "files.py" in covered
+
+
+def test_the_digest_of_the_code_covers_kernels_and_stages(tmp_path: pathlib.Path) -> None:
     found = {files.code_digest(tmp_path)}
     for name in ("a.py", "a.h"):
         (tmp_path / name).write_text("1")

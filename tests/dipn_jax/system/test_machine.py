@@ -6,14 +6,14 @@ import subprocess
 
 import pytest
 
-from dipn_jax import machine
+from dipn_jax.system import machine
 
 
 def test_a_commit_is_marked_where_a_python_file_differs(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "dipn_jax").mkdir()
-    monkeypatch.setattr(machine, "__file__", str(tmp_path / "dipn_jax" / "machine.py"))
+    (tmp_path / "dipn_jax" / "system").mkdir(parents=True)
+    monkeypatch.setattr(machine, "__file__", str(tmp_path / "dipn_jax" / "system" / "machine.py"))
     assert machine.commit() == "unknown"
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
     for words in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "x"]):

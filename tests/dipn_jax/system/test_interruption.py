@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from dipn_jax import console
-from dipn_jax.interruption import Interruption
+from dipn_jax.commands import console
+from dipn_jax.system.interruption import Interruption
 
 ALL = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1]
 

@@ -14,9 +14,10 @@ import socket
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, Literal
 
-from dipn_jax import addresses, console, machine
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
-from dipn_jax.interruption import STOPS
+from dipn_jax.system import addresses, machine
+from dipn_jax.system.interruption import STOPS
 
 AHEAD = 2
 """Tasks that are submitted for each one that the cluster can run at a time."""

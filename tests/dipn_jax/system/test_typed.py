@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from dipn_jax import typed
+from dipn_jax.system import typed
 
 FORM = {
     "kind": {"push", "grasp"},

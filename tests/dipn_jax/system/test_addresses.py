@@ -5,9 +5,10 @@ from typing import Any
 
 import pytest
 
-from dipn_jax import addresses, console, launch
-from dipn_jax.addresses import Place
+from dipn_jax.commands import console, launch
 from dipn_jax.errors import UserError
+from dipn_jax.system import addresses
+from dipn_jax.system.addresses import Place
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from dipn_jax import launch
+from dipn_jax.commands import launch
+from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
-from dipn_jax.launch import LOCAL, Launch
 
 
 class _Ray(types.ModuleType):

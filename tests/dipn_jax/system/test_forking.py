@@ -8,8 +8,8 @@ import sys
 import jax
 import pytest
 
-from dipn_jax import forking
 from dipn_jax.errors import UserError
+from dipn_jax.system import forking
 
 SCRIPT = """
 import multiprocessing, sys

@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from dipn_jax import addresses, command_paths, files
+from dipn_jax.commands import option_paths
 from dipn_jax.errors import UserError
-from dipn_jax.interruption import stops
+from dipn_jax.system import addresses, files
+from dipn_jax.system.interruption import stops
 
 if TYPE_CHECKING:
     import rich.progress
@@ -267,7 +268,7 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
             Any,
             tyro.conf.subcommand(
                 name,
-                constructor=command_paths.absolute(command),
+                constructor=option_paths.absolute(command),
                 description=_described(command, whole=name in arguments[:1]),
             ),
         ]
@@ -276,6 +277,6 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
     one_of_them: Any = Union[choices]  # noqa: UP007  a tuple
     program = pathlib.Path(sys.argv[0]).name
     options = (tyro.conf.OmitArgPrefixes,)
-    with command_paths.registry(arguments):
+    with option_paths.registry(arguments):
         code: int | None = tyro.cli(one_of_them, prog=program, description=description, args=arguments, config=options)
     return code

@@ -11,9 +11,10 @@ from dipn_jax.eval.clearing.tables import Tables
 from dipn_jax.train import cli as train_cli
 
 import dipn_jax
-from dipn_jax import addresses, console, files
+from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import resume
+from dipn_jax.system import addresses, files
 from dipn_jax.world import cases
 
 EVERY = {

@@ -74,7 +74,7 @@ def _quota(folder: pathlib.Path) -> float:
 
 def commit() -> str:
     """Return the commit of these sources, `-dirty` if a Python file differs from it; `unknown` outside a checkout."""
-    git = ["git", "-C", str(pathlib.Path(__file__).parent.parent)]
+    git = ["git", "-C", str(pathlib.Path(__file__).parents[2])]
     try:
         head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, check=True)
         changed = subprocess.run([*git, "status", "--porcelain", "--", "*.py"], capture_output=True, check=True)

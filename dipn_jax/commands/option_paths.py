@@ -13,8 +13,8 @@ from typing import Any
 
 from tyro import constructors
 
-from dipn_jax import addresses, files
 from dipn_jax.errors import UserError
+from dipn_jax.system import addresses, files
 
 
 def absolute(command: Callable[..., Any]) -> Callable[..., Any]:

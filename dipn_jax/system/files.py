@@ -17,8 +17,8 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from dipn_jax import addresses, temporary, typed
 from dipn_jax.errors import UserError
+from dipn_jax.system import addresses, temporary, typed
 
 EMPTY = "'': an empty path, as of a variable that is not set; give a path, or . for this folder"
 """What is said of an empty path."""
@@ -44,7 +44,7 @@ def _versions() -> dict[str, str]:
 def code_digest(*folders: pathlib.Path) -> str:
     """Return the SHA-256, in hex, of the packages' versions, the library's sources and those in other `folders`."""
     digest = hashlib.sha256(str(package_versions()).encode())
-    for folder in (pathlib.Path(__file__).parent, *folders):
+    for folder in (pathlib.Path(__file__).parents[1], *folders):
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.h")]):
             digest.update(read_bytes(path))
     return digest.hexdigest()
