@@ -7,7 +7,7 @@ PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
-INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e
+INSTALL := $(BIN)/pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e
 
 .PHONY: setup demo test test-slow lint bench mutants fuzz faults push-figures grasp-figures clear-figures help
 help: ; @sed -n 's/^# make/make/p' Makefile

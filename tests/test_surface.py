@@ -48,18 +48,30 @@ def _snippet(text: str) -> str:
     return textwrap.dedent("\n".join(itertools.takewhile(lambda line: not line or line.startswith(" "), lines)))
 
 
-@pytest.mark.parametrize("name", dipn_jax.__all__)
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """Return a folder of two runs, of networks with random weights."""
+    runs = tmp_path_factory.mktemp("runs")
+    for run, name, config in (("gn", "grasp", GraspConfig(width=8, coarse=8, blocks=1)), ("dipn", "dipn", DIPN)):
+        model = checkpoint.build(name, config)
+        checkpoint.save(runs / run, 1, {"model": nnx.state(model)}, network=name, config=config, extra={})
+    return runs
+
+
+DECIDING = ("Decision", "decide", "load_policy")
+"""Names whose use compiles a policy, which takes ten seconds each."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in DECIDING)) for name in dipn_jax.__all__]
+)
 def test_the_use_that_a_docstring_shows_runs(
-    name: str, settled: Any, data: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    name: str, settled: Any, data: Any, trained: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a reader would type it, with what the text before it has made."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "data").symlink_to(data["push"].parent)
-    model = checkpoint.build("grasp", GraspConfig(width=8, coarse=8, blocks=1))
-    parts = {"model": nnx.state(model)}
-    checkpoint.save(tmp_path / "runs/gn", 1, parts, network="grasp", config=model.config, extra={})
-    checkpoint.save(tmp_path / "runs/dipn", 1, {"model": nnx.state(checkpoint.build("dipn", DIPN))},
-                    network="dipn", config=DIPN, extra={})  # fmt: skip
+    (tmp_path / "runs").symlink_to(trained)
     (tmp_path / "mine.json").write_bytes(hard_cases_path().read_bytes())
     observation = dipn_jax.render(settled.scene[0], settled.poses[0])
     known = {

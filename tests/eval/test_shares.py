@@ -187,7 +187,7 @@ def _asked(words: list[str]) -> dict[str, Any]:
     return found[0]
 
 
-@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind == "sweep")) for kind in WORDS])
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind != "clear")) for kind in WORDS])
 def test_a_missing_part_is_named_with_the_command_that_makes_it(
     kind: str,
     evaluated: Callable[..., list[pathlib.Path]],

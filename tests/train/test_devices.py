@@ -177,6 +177,7 @@ def test_a_process_joins_others_where_a_job_manager_started_several(monkeypatch:
             assert len(joined) == wanted, name
 
 
+@pytest.mark.slow
 def test_a_step_is_compiled_and_nothing_written(task: PushTask, tmp_path: pathlib.Path) -> None:
     planned = fit(task, WHOLE, tmp_path / "run", compute=Compute(compile_only=True))
     weights = sum(leaf.nbytes for leaf in jax.tree.leaves(nnx.state(checkpoint.build("dipn", CONFIG))))

@@ -43,7 +43,7 @@ def test_scores_by_tables_are_scores_of_turned_maps() -> None:
     np.testing.assert_array_equal(quick[8:], quick[:8])
 
 
-@pytest.mark.parametrize("preset", ["compact", "paper"])
+@pytest.mark.parametrize("preset", ["compact", pytest.param("paper", marks=pytest.mark.slow)])
 def test_grasp_scores_are_deterministic_and_each_image_has_its_own(preset: str) -> None:
     model = grasp.GraspNet(grasp.GraspConfig(preset=preset, stages=(1, 1, 1, 1)), rngs=nnx.Rngs(0))
     model.eval()

@@ -87,12 +87,12 @@ def test_guided_grasps_are_where_the_scores_are_high_and_hard_ones_where_they_ar
     scores = scores.at[2, :40, :40].set(0.999)  # on the table: nothing to grasp
 
     def rotations(guided: float, hard: float) -> np.ndarray:
-        taken = candidates.sample_grasps(jax.random.key(0), seen, scores, count=40, guided=guided, hard=hard)
+        taken = candidates.sample_grasps(jax.random.key(0), seen, scores, count=16, guided=guided, hard=hard)
         return np.asarray(candidates.grasp_index(taken))[:, 0]
 
     assert (rotations(1.0, 0.0) == 5).mean() > 0.9
     assert (rotations(0.0, 1.0) == 9).mean() > 0.5
-    assert len(set(rotations(0.0, 0.0))) > 10, "the others are anywhere"
+    assert len(set(rotations(0.0, 0.0))) > 6, "the others are anywhere"
 
 
 def test_the_best_grasps_stand_apart() -> None:

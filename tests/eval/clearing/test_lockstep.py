@@ -16,6 +16,7 @@ from dipn_jax.structs import Push, Scene
 from dipn_jax.world import clutter, primitives
 
 
+@pytest.mark.slow
 def test_every_table_ends_by_the_rules(cleared: Any, tmp_path: pathlib.Path) -> None:
     tables, out = cleared
     for table in tables:
@@ -39,6 +40,7 @@ def test_every_table_ends_by_the_rules(cleared: Any, tmp_path: pathlib.Path) -> 
             film.load(cut)
 
 
+@pytest.mark.slow
 def test_a_saved_episode_can_be_simulated_again(cleared: Any, engine: Any) -> None:
     tables, out = cleared
     for number in range(len(tables)):

@@ -207,6 +207,7 @@ def test_grasp_evaluation_writes_what_it_promises(
         assert 0 <= values[f"grasp_success/{name}_low"] <= values[f"grasp_success/{name}"] <= 1
 
 
+@pytest.mark.slow
 def test_labels_of_pretraining_mostly_agree_with_physics(engine: Any) -> None:
     found = success.label_agreement(engine, scenes.fixed_count(1), scenes=16, seed=0)
     assert found["grasps"] > 48 and 0.1 < found["positive"] < 0.9

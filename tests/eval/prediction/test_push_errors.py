@@ -3,6 +3,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import pytest
 from dipn_jax.eval.prediction import push_errors
 from dipn_jax.eval.prediction.pushes import Executed
 
@@ -16,6 +17,7 @@ from dipn_jax.world import scenes
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
 
+@pytest.mark.slow
 def test_prediction_measures_the_baselines_as_they_are(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:

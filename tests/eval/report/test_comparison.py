@@ -11,6 +11,7 @@ from dipn_jax.system import files
 from experiments.fuzz_parsers import PARSERS
 
 
+@pytest.mark.slow
 def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib.Path) -> None:
     _, out = cleared
     one = comparison.Cleared(out)
@@ -25,6 +26,7 @@ def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib
     )
 
 
+@pytest.mark.slow
 def test_the_course_of_clearing_is_the_share_left_after_each_action(cleared: Any) -> None:
     tables, out = cleared
     shares = comparison.course(comparison.Cleared(out), np.array([0.0, 3.0]))

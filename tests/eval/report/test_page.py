@@ -15,6 +15,7 @@ from dipn_jax.storage import checkpoint
 from dipn_jax.storage.resume import Partial
 from dipn_jax.system import files
 from dipn_jax.world import scenes
+from experiments.fuzz_parsers import PARSERS
 
 CONFIG = scenes.fixed_count(3, spread=0.2)
 
@@ -77,9 +78,19 @@ def _renamed(folder: pathlib.Path, name: str) -> pathlib.Path:
     return folder
 
 
+@pytest.fixture
+def one_table(tmp_path: pathlib.Path) -> pathlib.Path:
+    """Return the folder of an evaluation of one table."""
+    (tmp_path / "one").mkdir()
+    PARSERS["film"].prepare(tmp_path / "one")
+    return tmp_path / "one"
+
+
 @pytest.mark.parametrize("name", NASTY)
-def test_what_users_named_is_text_in_pages_and_figures(name: str, cleared: Any, tmp_path: pathlib.Path) -> None:
-    folder = _renamed(pathlib.Path(shutil.copytree(cleared[1], tmp_path / "c")), name)
+def test_what_users_named_is_text_in_pages_and_figures(
+    name: str, one_table: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    folder = _renamed(one_table, name)
     run = tmp_path / name.replace("/", "-")
     run.mkdir()
     (run / "metrics.jsonl").write_text('{"step": 1, "loss": 1.0}\n')
@@ -93,12 +104,12 @@ def test_what_users_named_is_text_in_pages_and_figures(name: str, cleared: Any, 
     assert text.count("data:image/png;base64,") == 4, "each figure stands in its place, once"
 
 
-def test_two_folders_of_one_method_and_label_are_refused(cleared: Any, tmp_path: pathlib.Path) -> None:
-    other = pathlib.Path(shutil.copytree(cleared[1], tmp_path / "other"))
-    with pytest.raises(UserError, match=r"both are dipn.gn on hard; give one of them, or clear again with another"):
-        page.write(tmp_path / "o", page.Sources(clears=[cleared[1], other]))
+def test_two_folders_of_one_method_and_label_are_refused(one_table: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    other = pathlib.Path(shutil.copytree(one_table, tmp_path / "other"))
+    with pytest.raises(UserError, match=r"both are gn on hard; give one of them, or clear again with another"):
+        page.write(tmp_path / "o", page.Sources(clears=[one_table, other]))
     assert not (tmp_path / "o").exists()
     settings = files.read_json(other / "settings.json")
     files.write_json(other / "settings.json", settings | {"label": "again"})
-    values = page.write(tmp_path / "o", page.Sources(clears=[cleared[1], other]))
-    assert values["clear/hard/again/dipn+gn/grasps"] == values["clear/hard/dipn+gn/grasps"]
+    values = page.write(tmp_path / "o", page.Sources(clears=[one_table, other]))
+    assert values["clear/hard/again/gn/grasps"] == values["clear/hard/gn/grasps"]
