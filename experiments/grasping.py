@@ -44,9 +44,10 @@ def list_runs(root: pathlib.Path) -> list[Run]:
 
 def _online(run: Recipe, pretrained: pathlib.Path) -> None:
     """Add the runs of learning while grasping: eight seeds with pre-training, three without."""
-    online = "dipn-train grasp-online --grasps 400 --seed"
-    learnt = [run(f"runs/with-{seed}", online, f"{seed} --init", pretrained) for seed in range(8)]
-    learnt += [run(f"runs/without-{seed}", online, f"{seed}") for seed in range(3)]
+    online = "grasp-online --grasps 400"
+    after = run("runs/with", f"dipn-train sweep --seeds 0 1 2 3 4 5 6 7 -- {online} --init", pretrained)
+    plain = run("runs/without", f"dipn-train sweep --seeds 0 1 2 -- {online}")
+    learnt = [after / f"seed-{seed}" for seed in range(8)] + [plain / f"seed-{seed}" for seed in range(3)]
     run("online", "dipn-eval grasp --curve", learnt)
 
 

@@ -26,10 +26,10 @@ from experiments.runs import Recipe, Run
 STEPS = {100: 600, 300: 1000, 500: 1500, 1000: 2500, 1500: 3000, 51000: 10000}
 """Optimizer steps of the learning curve, by number of pushes in the training data."""
 
-TRAIN = "dipn-train push --eval-every 1000 --save-every 1000 --data"
-"""Start of a training command; a folder of pushes follows."""
+TRAIN = "push --eval-every 1000 --save-every 1000 --data"
+"""Start of a training command, without its program; a folder of pushes follows."""
 
-TRAIN_1500 = "dipn-train push --eval-every 1000 --save-every 1000 --limit 1500 --steps 3000 --data"
+TRAIN_1500 = f"dipn-train {TRAIN.replace('--data', '--limit 1500 --steps 3000 --data')}"
 """Start of a training command on 1,500 pushes; a folder of pushes follows."""
 
 ITEMS = {
@@ -48,17 +48,14 @@ def list_runs(root: pathlib.Path) -> list[Run]:
 
     # the learning curve: six numbers of pushes, three seeds each
     data = run("data", "dipn-datagen push --episodes 52000")
-    learnt = {
-        f"{pushes}-{seed}": run(f"runs/{pushes}-{seed}", TRAIN, data, f"--limit {pushes} --steps {steps} --seed {seed}")
-        for seed in range(3)
-        for pushes, steps in STEPS.items()
-    }
-    curves = [learnt[name] for name in sorted(learnt)]
+    limits, steps = (" ".join(map(str, numbers)) for numbers in (STEPS, STEPS.values()))
+    learnt = run("runs", f"dipn-train sweep --seeds 0 1 2 --limits {limits} --steps {steps} -- {TRAIN}", data)
+    curves = [learnt / f"{pushes}-{seed}" for pushes in STEPS for seed in range(3)]
     run("curve", "dipn-eval prediction --scenes 1000 --objects paper --curve", curves)
 
     # one network for every distance against one for each, and one trained on masks found in the image
     alone = {
-        "every": learnt["1500-0"],
+        "every": learnt / "1500-0",
         "only5": run("only5", TRAIN_1500, data, "--centimetres 5"),
         "only10": run("only10", TRAIN_1500, data, "--centimetres 10"),
         "found": run("found", TRAIN_1500, data, "--masks found"),
@@ -80,14 +77,14 @@ def list_runs(root: pathlib.Path) -> list[Run]:
         without = run(f"no-{name}", TRAIN_1500, data, f"--without {name}")
         unseen = f"dipn-eval prediction --scenes 500 --objects paper --no-segmented --items {items} --push-net"
         run(f"without-{name}", unseen, without)
-        run(f"with-{name}", unseen, learnt["1500-0"], "--no-physics")
+        run(f"with-{name}", unseen, learnt / "1500-0", "--no-physics")
 
     # crowds: networks trained on 8 to 15 objects and on 1 to 7
     crowds = run("crowds", "dipn-datagen push --objects 8:15 --episodes 6600")
     crowd = run("crowd", "dipn-train push --limit 1500 --steps 3000 --data", crowds)
     crowded = "dipn-eval prediction --scenes 500 --objects 8:15 --no-segmented --no-physics --push-net"
     run("crowd-crowded", crowded, crowd)
-    run("crowd-few", crowded, learnt["1500-0"])
+    run("crowd-few", crowded, learnt / "1500-0")
     return run.runs
 
 

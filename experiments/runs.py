@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import hashlib
 import importlib
+import itertools
 import json
 import pathlib
 import shlex
@@ -87,8 +88,9 @@ class Recipe:
           parts: program and arguments but `--out`, as `words` takes them.
           out: folder to write, if not the one called `name`.
         """
-        place = out or self.folder / name
-        self.runs.append(Run(name, place, (*words(parts), "--out", str(place))))
+        place, given = out or self.folder / name, words(parts)
+        end = given.index("--") if "--" in given else len(given)  # a command for each training follows
+        self.runs.append(Run(name, place, (*given[:end], "--out", str(place), *given[end:])))
         return place
 
     def borrow(self, others: Sequence[Run], name: str, *, prefix: str) -> pathlib.Path:
@@ -99,8 +101,10 @@ class Recipe:
 
 
 def needs(run: Run, others: Sequence[Run]) -> list[Run]:
-    """Return those of `others` whose folders the command of `run` reads, that is, has among its arguments."""
-    return [other for other in others if other.out != run.out and str(other.out) in run.command]
+    """Return the runs before `run` whose folders, or folders in them, its command has among its arguments."""
+    places = [place for word in run.command for place in (pathlib.Path(word), *pathlib.Path(word).parents)]
+    before = itertools.takewhile(lambda other: other.name != run.name, others)
+    return [other for other in before if other.out in places]
 
 
 def keys(listed: Sequence[Run]) -> dict[str, str]:
@@ -248,4 +252,7 @@ def parse(run: Run) -> dict[str, Any]:
         console.run(program, {**commands, arguments[0]: collect}, arguments)
     except SystemExit:
         raise UserError(f"{run.name}: {program} does not take these arguments: {run.line}") from None
+    if "--" in arguments:  # the command of each training of a sweep
+        training = (program, *arguments[arguments.index("--") + 1 :], "--out", str(run.out / "one"))
+        parse(dataclasses.replace(run, command=training))
     return found

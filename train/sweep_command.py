@@ -22,7 +22,12 @@ from .sweeping import Training
 
 RECORD = "sweep.json"
 """Name of the file with the trainings and what they measured, in the folder of them all."""
-_TRAINING = {"seed": typed.Whole(), "limit": typed.Maybe(typed.Whole(1)), "values": typed.Maybe({str: float})}
+_TRAINING = {
+    "seed": typed.Whole(),
+    "limit": typed.Maybe(typed.Whole(1)),
+    "steps?": typed.Maybe(typed.Whole(1)),
+    "values": typed.Maybe({str: float}),
+}
 _FORM = {"command": [str], "trainings": {str: _TRAINING}}
 _FREE = ("out", "seed", "limit", "threads", "memory", "data_parallel", "profile")
 """Options that differ between trainings, or on which no result depends."""
@@ -33,6 +38,7 @@ def sweep(
     out: pathlib.Path,
     seeds: tuple[int, ...] = (0,),
     limits: tuple[int, ...] = (),
+    steps: tuple[int, ...] = (),
     at_once: int = 1,
     launch: Annotated[Launch, tyro.conf.arg(name="")] = LOCAL,
 ) -> None:
@@ -49,6 +55,7 @@ def sweep(
       out: folder for the runs and sweep.json, the last values in the metrics.jsonl of each.
       seeds: seeds; all limits of one are trained before the next.
       limits: numbers of the first episodes of --data that push or grasp learn from; what is held out stays the same.
+      steps: optimizer steps with each of --limits, in their order; if not given, all make those of --steps after --.
       at_once: trainings at a time, where they are launched locally.
       launch: where trainings run, each in a process of its own.
     """
@@ -60,9 +67,9 @@ def sweep(
 
     from . import sweeping
 
-    trainings = plan(command, out, seeds=seeds, limits=limits)
+    trainings = plan(command, out, seeds=seeds, limits=limits, steps=steps)
     with owner.owned(out):
-        record = _record(out, trainings)
+        record = _record(out, trainings, own_steps=bool(steps))
         listed = record["trainings"]
         todo = [each for each in trainings if listed[each.name]["values"] is None or not each.given["out"].is_dir()]
         sweeping.check(todo)
@@ -78,7 +85,9 @@ def sweep(
         console.say(line)
 
 
-def plan(command: Sequence[str], out: pathlib.Path, *, seeds: Sequence[int], limits: Sequence[int]) -> list[Training]:
+def plan(
+    command: Sequence[str], out: pathlib.Path, *, seeds: Sequence[int], limits: Sequence[int], steps: Sequence[int] = ()
+) -> list[Training]:
     """Return the trainings, in order.
 
     Args:
@@ -86,9 +95,10 @@ def plan(command: Sequence[str], out: pathlib.Path, *, seeds: Sequence[int], lim
       out: folder of them all.
       seeds: of the trainings.
       limits: numbers of episodes learnt from; none: the command says it.
+      steps: optimizer steps with each limit; none: the command says it.
 
     Raises:
-      UserError: the command is none that trains, or seeds or limits make no sense.
+      UserError: the command is none that trains, or seeds, limits or steps make no sense.
     """
     kind, given = _parsed(command, out)
     for name, values in (("seeds", seeds), ("limits", limits)):
@@ -100,6 +110,7 @@ def plan(command: Sequence[str], out: pathlib.Path, *, seeds: Sequence[int], lim
         raise UserError(f"--limits: dipn-train {kind} takes no --limit; give push or grasp, or seeds only")
     if limits and given["limit"] is not None:
         raise UserError(f"--limits, and --limit {given['limit']} after --: give one of them")
+    _check_steps(command, limits=limits, steps=steps)
     for seed in seeds:
         console.require_seed(seed)
     compute = given.get("compute")
@@ -107,12 +118,28 @@ def plan(command: Sequence[str], out: pathlib.Path, *, seeds: Sequence[int], lim
         raise UserError("sweep: a training is one process that trains; leave out --compile-only and --coordinator")
     trainings = []
     for seed in seeds:
-        for limit in limits or (given.get("limit"),):
+        for number, limit in enumerate(limits or (given.get("limit"),)):
             name = f"seed-{seed}" if limit is None else f"{limit}-{seed}"
-            own = {"out": out / name, "config": dataclasses.replace(given["config"], seed=seed)}
+            config = {"seed": seed} | ({"steps": steps[number]} if steps else {})
+            own = {"out": out / name, "config": dataclasses.replace(given["config"], **config)}
             own |= {"limit": limit} if limits else {}
             trainings.append(Training(name, kind, given | own, seed, limit))
     return trainings
+
+
+def _check_steps(command: Sequence[str], *, limits: Sequence[int], steps: Sequence[int]) -> None:
+    """Return if there are steps for every limit, or none at all.
+
+    Raises:
+      UserError: there are not, one is below 1, or the command says how many, too.
+    """
+    said = f"--steps {' '.join(map(str, steps))}"
+    if steps and len(steps) != len(limits):
+        raise UserError(f"{said}: {len(steps)} for {len(limits)} of --limits; give one for each, in their order")
+    if steps and min(steps) < 1:
+        raise UserError(f"{said}: want whole numbers from 1 on")
+    if steps and any(word.partition("=")[0] == "--steps" for word in command):
+        raise UserError(f"{said}, and --steps after --; give one of them")
 
 
 def _parsed(command: Sequence[str], out: pathlib.Path) -> tuple[str, dict[str, Any]]:
@@ -133,8 +160,10 @@ def _parsed(command: Sequence[str], out: pathlib.Path) -> tuple[str, dict[str, A
     return command[0], given
 
 
-def _record(out: pathlib.Path, trainings: Sequence[Training]) -> dict[str, Any]:
+def _record(out: pathlib.Path, trainings: Sequence[Training], *, own_steps: bool) -> dict[str, Any]:
     """Return the content of `sweep.json` with all trainings in it, those that are there with what they measured.
+
+    Where each limit has its own steps (`own_steps`), one that made another number of them has measured nothing yet.
 
     Raises:
       UserError: it is damaged, or those there are of another command.
@@ -143,7 +172,8 @@ def _record(out: pathlib.Path, trainings: Sequence[Training]) -> dict[str, Any]:
 
     first = trainings[0]
     commands: dict[str, Any] = cli.COMMANDS
-    command = [first.kind, *command_line.words(commands[first.kind], first.given, without=_FREE)]
+    free = (*_FREE, "steps") if own_steps else _FREE
+    command = [first.kind, *command_line.words(commands[first.kind], first.given, without=free)]
     path = out / RECORD
     record: dict[str, Any] = {"command": command, "trainings": {}}
     record = files.read_json(path, wanted=_FORM) if path.exists() else record
@@ -151,7 +181,10 @@ def _record(out: pathlib.Path, trainings: Sequence[Training]) -> dict[str, Any]:
         theirs = shlex.join(["dipn-train", *record["command"]])
         raise UserError(f"{out}: has trainings by `{theirs}`; give that, or another --out")
     for each in trainings:
-        record["trainings"].setdefault(each.name, {"seed": each.seed, "limit": each.limit, "values": None})
+        new = {"seed": each.seed, "limit": each.limit, "values": None}
+        new |= {"steps": each.given["config"].steps} if own_steps else {}
+        known = record["trainings"].get(each.name, new)
+        record["trainings"][each.name] = known if known.get("steps") == new.get("steps") else new
     return record
 
 

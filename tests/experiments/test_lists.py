@@ -7,7 +7,7 @@ import pytest
 
 from experiments import clearing, demo, grasping, push_prediction, runs
 
-COUNTS = {demo: 11, push_prediction: 52, grasping: 31, clearing: 261}
+COUNTS = {demo: 11, push_prediction: 35, grasping: 22, clearing: 261}
 """Number of runs of each experiment."""
 
 each = pytest.mark.parametrize("experiment", COUNTS, ids=lambda module: module.__name__.rpartition(".")[2])
@@ -33,11 +33,12 @@ def test_every_folder_that_a_run_reads_is_written_before(experiment: ModuleType)
     root = pathlib.Path("results")
     listed = experiment.list_runs(root)
     assert len({run.name for run in listed}) == len({run.out for run in listed}) == len(listed)
-    written: set[str] = set()
+    written: set[pathlib.Path] = set()
     for run in listed:
-        read = {word for word in run.command if word.startswith(f"{root}/")} - {str(run.out)}
-        assert read <= written, run.name
-        written.add(str(run.out))
+        read = {pathlib.Path(word) for word in run.command if word.startswith(f"{root}/")} - {run.out}
+        for place in read:
+            assert any(place.is_relative_to(out) for out in written), run.name
+        written.add(run.out)
     assert len(runs.keys(listed)) == len(listed)
 
 
@@ -56,9 +57,9 @@ def test_the_recipes_that_figures_were_made_with() -> None:
     push, grasp, clear = (
         {run.name: run for run in module.list_runs(root)} for module in (push_prediction, grasping, clearing)
     )
-    assert push["runs/51000-2"].line == (
-        "dipn-train push --eval-every 1000 --save-every 1000 --data results/push/data --limit 51000 --steps 10000 "
-        "--seed 2 --out results/push/runs/51000-2"
+    assert push["runs"].line == (
+        "dipn-train sweep --seeds 0 1 2 --limits 100 300 500 1000 1500 51000 --steps 600 1000 1500 2500 3000 10000 "
+        "--out results/push/runs -- push --eval-every 1000 --save-every 1000 --data results/push/data"
     )
     assert push["with-concave"].line == (
         "dipn-eval prediction --scenes 500 --objects paper --no-segmented --items concave concave_slim "

@@ -1,5 +1,6 @@
 """Lists of runs: their order, which are skipped or made again, interruptions, the command line."""
 
+import dataclasses
 import os
 import pathlib
 import signal
@@ -79,6 +80,17 @@ def test_a_selected_run_includes_the_runs_that_it_needs(fake, tmp_path: pathlib.
     assert runs.select(listed, []) == listed
     with pytest.raises(UserError, match="--only e: no such run"):
         runs.select(listed, ["a", "e"])
+
+
+def test_a_folder_inside_the_one_that_a_run_writes_is_of_that_run(tmp_path: pathlib.Path) -> None:
+    run = Recipe(tmp_path)
+    learnt = run("runs", "dipn-train sweep --seeds 0 1 -- push --data", tmp_path / "data")
+    run("runs-2", "dipn-eval prediction --push-net", learnt / "seed-1")
+    first, second = run.runs
+    assert first.command[-4:] == ("--", "push", "--data", str(tmp_path / "data")) and "--out" in first.command
+    assert runs.needs(second, run.runs) == [first] and not runs.needs(first, run.runs)
+    with pytest.raises(UserError, match="runs: dipn-train does not take these arguments"):
+        runs.parse(dataclasses.replace(first, command=(*first.command, "--bananas")))
 
 
 def test_a_borrowed_run_is_the_same_run(fake, tmp_path: pathlib.Path) -> None:

@@ -101,6 +101,19 @@ def test_each_seed_and_limit_is_trained_once_and_more_can_be_added(
     assert {"seed-0", "9-0"} < set(_starts(tmp_path))
 
 
+def test_each_limit_may_have_its_own_steps(quick: None, tmp_path: pathlib.Path) -> None:
+    assert _sweep(tmp_path, "--limits", "8", "16", "--steps", "3", "5") == 0
+    planned = sweep_command.plan(("push", "--data", "data"), tmp_path, seeds=(0, 1), limits=(8, 16), steps=(3, 5))
+    assert [(each.name, each.given["config"].steps) for each in planned] == [
+        ("8-0", 3), ("16-0", 5), ("8-1", 3), ("16-1", 5)]  # fmt: skip
+    assert "--steps 5" in " ".join(planned[1].words())
+    kept = files.read_json(tmp_path / sweep_command.RECORD)
+    assert kept["command"] == ["push", "--data", str(pathlib.Path("data").absolute())]
+    assert [kept["trainings"][name]["steps"] for name in ("8-0", "16-0")] == [3, 5]
+    assert _sweep(tmp_path, "--limits", "16", "8", "--steps", "5", "4") == 0
+    assert _starts(tmp_path) == {"8-0": 2, "16-0": 1}, "one that is to make more steps goes on"
+
+
 def test_a_mistake_ends_the_job_before_anything_is_written(
     quick: None, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,6 +127,10 @@ def test_a_mistake_ends_the_job_before_anything_is_written(
         (("--at-once", "0"), push, "--at-once 0"),
         (("--at-once", "2", "--launcher", "ray"), push, "--at-once: for --launcher local"),
         (("--limits", "8"), (*push, "--limit", "8"), "--limits, and --limit 8 after --: give one of them"),
+        (("--limits", "8", "9", "--steps", "3"), push, "--steps 3: 1 for 2 of --limits; give one for each"),
+        (("--steps", "3"), push, "--steps 3: 1 for 0 of --limits"),
+        (("--limits", "8", "--steps", "0"), push, "--steps 0: want whole numbers from 1 on"),
+        (("--limits", "8", "--steps", "3"), (*push, "--steps=9"), "--steps 3, and --steps after --; give one of them"),
         (("--limits", "8"), ("grasp-pretrain", "--data", "data"), "dipn-train grasp-pretrain takes no --limit"),
         ((), (*push, "--seed=1"), "--seed=1 after --; give --out and --seeds before it"),
         ((), (*push, "--compile-only"), "leave out --compile-only"),
