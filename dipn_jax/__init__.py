@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dipn_jax.errors import UserError
     from dipn_jax.physics import make_engine
+    from dipn_jax.planning.memory import MissedGrasps
     from dipn_jax.planning.methods import PolicyConfig, load_policy
     from dipn_jax.planning.planner import decide
     from dipn_jax.sight.imagine import imagine
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Decision",
     "Grasp",
+    "MissedGrasps",
     "Observation",
     "PolicyConfig",
     "Push",
@@ -58,6 +60,7 @@ _MODULES = {
     "errors": ("UserError",),
     "structs": ("Decision", "Grasp", "Observation", "Push", "Scene"),
     "physics": ("make_engine",),
+    "planning.memory": ("MissedGrasps",),
     "planning.methods": ("PolicyConfig", "load_policy"),
     "planning.planner": ("decide",),
     "sight.imagine": ("imagine",),

@@ -30,5 +30,5 @@ class Purpose(enum.IntEnum):
 
 
 def key(seed: int, purpose: Purpose) -> Key[jax.Array, ""]:
-    """Return the random key of a purpose at a seed; what begins at different purposes never meets."""
+    """Return the random key of a purpose at a seed; keys of different purposes are independent of one another."""
     return jax.random.fold_in(jax.random.key(seed), purpose)

@@ -33,7 +33,7 @@ ABSENT = -1
 class Fault(enum.IntFlag):
     """Bits of a fault code: a simulation that goes wrong returns one and raises nothing.
 
-    A member is an `int`, but NumPy treats it as an int64, while a plain 1 takes the type of the array beside it.
+    In NumPy expressions a member counts as an int64; `int(Fault.SPEED)` takes the type of the array beside it.
     """
 
     NON_FINITE = 1  # a position or velocity became inf or NaN

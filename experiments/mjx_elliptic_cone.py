@@ -11,6 +11,7 @@ NaN end of the bracket. Clamping the root's argument is all that this script cha
 
 from __future__ import annotations
 
+import argparse
 import types
 from typing import Any
 
@@ -75,6 +76,7 @@ def peak_c(spec: mujoco.MjModel, qpos: np.ndarray) -> float:
 
 def main() -> None:
     """Run the experiment and print its table."""
+    argparse.ArgumentParser(prog="python -m experiments.mjx_elliptic_cone", description=__doc__).parse_args()
     spec, start = mujoco.MjModel.from_xml_string(MJCF), starts()
     for name, root in ROOTS.items():
         solver.jp = types.SimpleNamespace(**{**vars(jnp), "sqrt": root})

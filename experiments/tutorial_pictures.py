@@ -1,7 +1,11 @@
-"""Make the pictures of docs/tutorial.md with the code that stands on that page."""
+"""Make the pictures of docs/tutorial.md with the code that stands on that page.
+
+python -m experiments.tutorial_pictures
+"""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import pathlib
 import re
@@ -24,6 +28,7 @@ def run(page: pathlib.Path) -> dict[str, Any]:
 
 def main() -> None:
     """Make the pictures where the page looks for them."""
+    argparse.ArgumentParser(prog="python -m experiments.tutorial_pictures", description=__doc__).parse_args()
     with contextlib.chdir(DOCS):
         run(DOCS / "tutorial.md")
 

@@ -245,7 +245,7 @@ def test_the_commands_from_data_to_cleared_tables_work_at_small_scale(
 def test_commands_of_howtos_work_at_small_scale(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the commands in `RUN`, in one folder.
 
-    All other commands of how-tos are parsed by `test_commands_are_ones_that_exist`: they clear tables, measure, learn
+    All other commands of how-tos are parsed by `test_commands_on_pages_exist`: they clear tables, measure, learn
     grasps or need another engine, which takes minutes even when it is made small, or the tutorial runs the same.
     """
     monkeypatch.chdir(tmp_path)

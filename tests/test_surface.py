@@ -28,7 +28,7 @@ DIPN = DipnConfig(width=8)
 
 
 def test_every_public_name_exists_and_shows_its_use() -> None:
-    assert 15 <= len(dipn_jax.__all__) <= 18 and sorted(dipn_jax.__all__) == dipn_jax.__all__
+    assert 15 <= len(dipn_jax.__all__) <= 20 and sorted(dipn_jax.__all__) == dipn_jax.__all__
     assert set(dipn_jax.__all__) == set(dipn_jax._HOME) <= set(dir(dipn_jax))
     for name in dipn_jax.__all__:
         item = getattr(dipn_jax, name)

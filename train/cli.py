@@ -56,7 +56,7 @@ def _begin(data: Folders, config: TrainConfig, out: pathlib.Path, compute: Compu
 
 @contextlib.contextmanager
 def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
-    """Say where the examples of a run are kept; those of a program that is only compiled are not."""
+    """Yield where the examples of a run are kept: in its folder, or in a temporary one if it is only compiled."""
     import jax
 
     from .example_store import Room
@@ -76,7 +76,7 @@ def _local(data: Folders) -> tuple[pathlib.Path, ...]:
 
 
 def _initial(init: pathlib.Path | None, network: str) -> Any:
-    """The network to start from, if one is given."""
+    """Return the network to start from; None if none is given."""
     from dipn_jax.storage import checkpoint
 
     return checkpoint.load_network(init, network=network) if init else None

@@ -32,7 +32,7 @@ MOMENTS: dict[str, tuple[str, ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """What an episode, or a step of one, has one of."""
+    """One column of an export: a value for each episode, or for each of its steps."""
 
     name: str
     shape: tuple[int | str, ...]  # `N` is the number of object slots

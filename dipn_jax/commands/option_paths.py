@@ -50,7 +50,7 @@ def require_file(path: pathlib.Path, *suffixes: str, option: str) -> None:
 
 
 def registry(arguments: Sequence[str]) -> constructors.ConstructorRegistry:
-    """Return how tyro makes paths of the words `arguments`: an empty one is refused, as of a variable that is not set.
+    """Return tyro's constructors for a command line with the words `arguments`: paths of them may not be empty.
 
     `pathlib` takes an empty text for the folder that we are in, and does not tell it from `.` afterwards.
     """

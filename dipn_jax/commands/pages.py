@@ -14,7 +14,7 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 
 
 def escaped(text: str) -> str:
-    """Return what a user named, for a page: neither markup nor the place of a figure (`{NAME}`)."""
+    """Return a user's text as HTML shows it: what is markup is escaped, and `{`, which marks the places of figures."""
     readable = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     return html.escape(readable).replace("{", "&#123;")
 

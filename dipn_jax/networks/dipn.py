@@ -82,7 +82,7 @@ class _Paper(nnx.Module):
 
 
 class _Compact(nnx.Module):
-    """`Stepwise`, read at any distance: an example is learnt from at all distances, and all of them cost one pass."""
+    """`Stepwise`, read at any distance: one pass predicts the motions at all distances, and all are learnt from."""
 
     def __init__(self, config: DipnConfig, rngs: nnx.Rngs) -> None:
         self.steps = stepwise.Stepwise(config.view, config.width, config.features, config.rounds, rngs)

@@ -217,7 +217,7 @@ def flat_pixels(image: Float[jax.Array, "H W 4"]) -> Float[jax.Array, "H*W+1 4"]
 def turning_tables(
     turns: int,
 ) -> tuple[Int[np.ndarray, "{turns} 80 80 16"], Int[np.ndarray, "{turns} 224 224"]]:
-    """Return from where each pixel is taken when the first `turns` rotations are applied, and undone.
+    """Return tables of indices that turn an image by each of the first `turns` angles, and turn scores back.
 
     Returns:
       For each pixel of each cell of the turned views, its pixel in the image (the one past the end is table); and for

@@ -80,7 +80,7 @@ def _extents(
 def _felt(
     cells: Int[jax.Array, "T S"], least: Float[jax.Array, "T 2"], extent: Float[jax.Array, "T 2"], axis: int
 ) -> Bool[jax.Array, "T S"]:
-    """Return which columns (axis 0) or rows (axis 1) `cells` have scores that a change alters."""
+    """Return which columns (axis 0) or rows (axis 1) of `cells` have a changed pixel in their receptive field."""
     low, high = (
         least[:, axis, None] - FELT_PIXELS[axis],
         least[:, axis, None] + extent[:, axis, None] + FELT_PIXELS[axis],

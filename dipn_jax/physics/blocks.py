@@ -152,7 +152,7 @@ def _call(blocks: int, contacts: int, rows: int, equalities: int, iterations: in
 
 
 def _sides(m: Any) -> np.ndarray:
-    """Return what moves each geom, as `Problem.side` says it: `[ngeom]`."""
+    """Return for each geom which joints move it, coded as in `Problem.side`: `[ngeom]`."""
     dof_body, parent = np.asarray(m.dof_bodyid), np.asarray(m.body_parentid)
     code = np.full(len(parent), -1)
     for body in range(1, len(parent)):

@@ -20,7 +20,7 @@ _CODE_AT_IMPORT = files.code_digest()
 def program(
     function: Callable[..., tuple[Array, ...]], arguments: Sequence[np.ndarray], *, what: str, donate: Sequence[int]
 ) -> Callable[..., tuple[Array, ...]]:
-    """Return `jax.jit(function)`, with the trace that an earlier process made if there is one.
+    """Return `jax.jit(function)`, with the trace that an earlier process has kept on disk if there is one.
 
     Args:
       function: of arrays, for one device, of the default kind.

@@ -33,12 +33,10 @@ class MissedGrasps:
     """Grasps that missed on one table, and what the height map around each was before it. It is never changed.
 
     Example:
-      memory = MissedGrasps()
-      while ...:
-          memory = memory.recall(observation.height)
-          decision = policy(key, observation, missed=memory.pixels())
-          ...                                        # the grasp is made, and holds nothing
-          memory = memory.add(decision.grasp_pixel, observation.height)
+      memory = dipn_jax.MissedGrasps()
+      decision = policy(key, observation, missed=memory.pixels())
+      memory = memory.add(decision.grasp_pixel, observation.height)   # if the grasp held nothing
+      memory = memory.recall(observation.height)                      # when the table is seen again
     """
 
     grasps: tuple[np.ndarray, ...] = ()  # [3] int32 rotation, row, col; the latest last

@@ -55,7 +55,7 @@ class Policy:
         Args:
           key: random key, for the candidates.
           observation: what the camera sees.
-          missed: grasps (rotation, row, col) that missed on this table as it is.
+          missed: grasps (rotation, row, col) that missed on this table as it is, from `dipn_jax.MissedGrasps`.
 
         Raises:
           UserError: the observation is none of those that `dipn_jax.check_observation` lets through, all that lies on

@@ -1,7 +1,7 @@
-"""Push or grasp? Alg. 2 of the paper, and the rule of two score maps. Predictor and scorer are arguments.
+"""Push or grasp? Alg. 2 of the paper, and the comparison of two score maps. Predictor and scorer are arguments.
 
 `decide` is one jitted call: candidates, predicted images and the scores of every grasp on each of them never leave the
-device. Its two halves are `find_candidates` and `decide_among`; they serve predictors that are no function of an image.
+device. Its two halves are `find_candidates` and `decide_among`; they serve predictors that need the simulator's state.
 """
 
 from __future__ import annotations
@@ -49,20 +49,17 @@ class Rule(Pytree):
     """
 
     gamma: Float[Array, ""] | float = 0.9  # discount of a push's value
-    grasp_above: Float[Array, ""] | float = (
-        0.7  # grasp at once if the best score is higher; 1 switches this short cut off
-    )
-    edge_factor: Float[Array, ""] | float = (
-        1.0  # a predicted motion is multiplied by it to judge whether an object leaves the workspace
-    )
+    # grasp at once if the best score is higher; 1 switches this short cut off
+    grasp_above: Float[Array, ""] | float = 0.7
+    # a predicted motion is multiplied by it to judge whether an object leaves the workspace
+    edge_factor: Float[Array, ""] | float = 1.0
     draw_all: Bool[Array, ""] | bool = False  # draw also motions below UNDRAWN_SHIFT and UNDRAWN_TURN
     top_margin: Float[Array, ""] | float = 0.0  # see `candidates.grasp_from_top`
     # clauses that only DIPN's released code has
     grasp_lone: Bool[Array, ""] | bool = False  # a lone object is grasped
     push_must_raise_best: Bool[Array, ""] | bool = False  # a push must raise the best score, too
-    discount_above: Float[Array, ""] | float = (
-        0.0  # gamma discounts only pushes after which the best score is higher (released: 0.5)
-    )
+    # gamma discounts only pushes after which the best score is higher (released: 0.5)
+    discount_above: Float[Array, ""] | float = 0.0
 
 
 RELEASED = Rule(edge_factor=2.0, grasp_lone=True, push_must_raise_best=True, discount_above=0.5)

@@ -128,7 +128,7 @@ def missing(folder: pathlib.Path, held: Mapping[int, int]) -> str | None:
 
 
 def _command(folder: pathlib.Path, gaps: Sequence[int], *, every: bool) -> str:
-    """Return the command that fills the gaps: that of the worker whose they are, or of one that makes everything."""
+    """Return the command that makes the missing shards: of the one worker that they belong to, or without a worker."""
     path = folder / ASKED
     if not path.exists():
         return "the command that made it again"

@@ -14,7 +14,7 @@ from dipn_jax.system import files, typed
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """What an array has to be."""
+    """The types and the shape that an array must have."""
 
     kinds: str  # kinds of NumPy: f float, i int, u unsigned, b bool, U text
     shape: tuple[int | str, ...]  # lengths, or the name of one: the same in all arrays of a file

@@ -58,7 +58,7 @@ def shard_path(folder: pathlib.Path, index: int) -> pathlib.Path:
 
 
 def shard_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Return what has a shard's name in a folder, in order."""
+    """Return the paths of the files with a shard's name in a folder, sorted."""
     return sorted(folder.glob("shard-*.parquet"))
 
 

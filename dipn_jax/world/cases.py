@@ -39,7 +39,7 @@ def hard_cases_path() -> pathlib.Path:
 
 
 def heldout_cases_path() -> pathlib.Path:
-    """Return the path of the fifteen cases that come with the package and by which nothing is chosen."""
+    """Return the path of the fifteen cases that come with the package and on which no setting was tuned."""
     return _DATA / "heldout_cases.json"
 
 

@@ -99,7 +99,7 @@ def spots(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> np.
 
 
 def filled(height: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Return a height map `[H, W]` whose `holes` have the height of the nearest pixel that is none."""
+    """Return a height map `[H, W]` in which each of the `holes` has the height of the nearest pixel outside them."""
     from scipy import ndimage
 
     rows, cols = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)

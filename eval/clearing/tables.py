@@ -25,7 +25,7 @@ class Tables:
     """Which tables are cleared."""
 
     cases: str = "hard"
-    """hard (ten hand-placed cases), heldout (fifteen, by which nothing is chosen), random, or a case file."""
+    """hard (ten hand-placed cases), heldout (fifteen, on which no setting was tuned), random, or a case file."""
     names: tuple[str, ...] = ()
     """Only these cases of the file."""
     objects: str = "10"

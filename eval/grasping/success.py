@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,45 +26,10 @@ from ..clearing import instances, lockstep, on_tables
 from ..clearing.camera import DEFAULT_CAMERA, Camera
 from ..clearing.instances import Instance
 from ..shares import WHOLE, Share
-from . import rates
 from .rates import Arrays
 
 NO_OTHERS: Arrays = {"missed_table": np.zeros(0, int), "missed_held": np.zeros(0, bool)}
 """No miss after which others were tried."""
-
-
-def evaluate(
-    scorer: Scorer,
-    engine: Engine,
-    config: SceneConfig,
-    partial: resume.Partial,
-    *,
-    scenes: int,
-    seed: int,
-    others: int = 0,
-    camera: Camera = DEFAULT_CAMERA,
-    aids: tuple[Aid, ...] = ALL_AIDS,
-) -> tuple[dict[str, Any], list[Instance]]:
-    """Measure what `tried` finds on all tables.
-
-    Args:
-      scorer: as of `tried`, like the others.
-      engine: physics engine.
-      config: scenes.
-      partial: where an interrupted evaluation is kept.
-      scenes: number of tables.
-      seed: random seed of the scenes and of the random grasps.
-      others: where a grasp missed, how many of the next best to try.
-      camera: what the scorer sees.
-      aids: those of choosing a grasp that are not the scorer's.
-
-    Returns:
-      Flat metrics, as `rates.rates`; and the tables, ended.
-    """
-    found, tables = tried(
-        scorer, engine, config, partial, scenes=scenes, seed=seed, others=others, camera=camera, aids=aids
-    )
-    return rates.rates(found, tables, others=others), tables
 
 
 def tried(
@@ -76,9 +40,9 @@ def tried(
     *,
     scenes: int,
     seed: int,
-    others: int,
-    camera: Camera,
-    aids: tuple[Aid, ...],
+    others: int = 0,
+    camera: Camera = DEFAULT_CAMERA,
+    aids: tuple[Aid, ...] = ALL_AIDS,
     share: Share = WHOLE,
 ) -> tuple[Arrays, list[Instance]]:
     """Try the best-scored grasp until every table is empty, by the end rules of `eval.clearing`; also a random one.
@@ -200,11 +164,6 @@ def _next_best(seen: Observation, missed: jax.Array, tried: jax.Array, *, scorer
         return candidates.grasp_at(best, image.height)
 
     return jax.lax.map(one, (seen, missed, tried))
-
-
-def label_agreement(engine: Engine, config: SceneConfig, *, scenes: int, seed: int, each: int = 4) -> dict[str, float]:
-    """Measure how often the labels of pre-training agree with physics, as `labels_tried` and `rates.label_rates`."""
-    return rates.label_rates(labels_tried(engine, config, scenes=scenes, seed=seed, each=each))
 
 
 def labels_tried(

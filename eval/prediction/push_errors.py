@@ -42,38 +42,6 @@ Rows = dict[str, list[np.ndarray]]
 """Errors `[B, K, N]` of each batch, by predictor and measure; also which masks were `visible` and which `moved`."""
 
 
-def evaluate(
-    networks: Mapping[str, DIPN],
-    engine: Engine,
-    config: SceneConfig,
-    partial: resume.Partial,
-    *,
-    scenes: int,
-    seed: int,
-    physics: bool,
-    segmented: bool,
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """Measure the errors of every predictor on held-out scenes, one push each.
-
-    Args:
-      networks: as of `measured`, like the others.
-      engine: the engine whose result counts as the truth.
-      config: scenes.
-      partial: where an interrupted evaluation is kept.
-      scenes: number of scenes.
-      seed: random seed of the scenes and pushes.
-      physics: also roll the engine out with nominal mass and friction.
-      segmented: also measure with masks found in the image.
-
-    Returns:
-      Flat metrics, and pictures `[F, ...]` of some pushes (before, predicted, after 10 cm).
-    """
-    rows, films = measured(
-        networks, engine, config, partial, scenes=scenes, seed=seed, physics=physics, segmented=segmented
-    )
-    return summary(rows), films
-
-
 def measured(
     networks: Mapping[str, DIPN],
     engine: Engine,

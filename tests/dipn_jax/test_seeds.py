@@ -56,11 +56,11 @@ def _commands(engine: Any, out: pathlib.Path) -> dict[str, Callable[[], Any]]:
         "baseline": lambda: baseline.learn(
             engine, CONFIG, baseline.BaselineConfig("rea", tables=EACH, seed=SEED), out / "b"
         ),
-        "prediction": lambda: push_errors.evaluate(
+        "prediction": lambda: push_errors.measured(
             {}, engine, CONFIG, partial, **count, physics=False, segmented=False
         ),
-        "grasp": lambda: success.evaluate(nothing, engine, CONFIG, partial, **count),
-        "grasp, single objects": lambda: success.label_agreement(engine, CONFIG, **count),
+        "grasp": lambda: success.tried(nothing, engine, CONFIG, partial, **count),
+        "grasp, single objects": lambda: success.labels_tried(engine, CONFIG, **count),
         "clear": lambda: Tables("random", objects="3", instances=EACH).make(engine, seed=SEED),
         "sweep": lambda: sweeping.measured(nothing, engine, CONFIG, (0.1,), **count, longest=0.1),
     }

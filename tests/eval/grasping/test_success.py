@@ -149,7 +149,7 @@ def test_labels_are_held_against_the_grasps_that_went_well(monkeypatch: pytest.M
 
     monkeypatch.setattr(success, "_labelled", labelled)
     monkeypatch.setattr(clutter, "settled_scenes", lambda *_: items)
-    found = success.label_agreement(Lifts(), CONFIG, scenes=5, seed=0, each=2)  # type: ignore[arg-type]
+    found = rates.label_rates(success.labels_tried(Lifts(), CONFIG, scenes=5, seed=0, each=2))  # type: ignore[arg-type]
     wanted = {"grasps": 8, "agree": 5 / 8, "positive_holds": 3 / 5, "negative_fails": 2 / 3, "positive": 5 / 8}
     assert found == pytest.approx(wanted)
 
@@ -168,7 +168,9 @@ def test_the_rates_are_of_all_grasps_and_of_the_first(monkeypatch: pytest.Monkey
     random = {"random_usable": np.ones(4, bool), "random_success": np.ones(4, bool), "random_score": np.ones(4)}
     monkeypatch.setattr(success, "_random_foreground", lambda *_: random)
     monkeypatch.setattr(on_tables, "in_lockstep", lambda policy, camera: policy)
-    found, _ = success.evaluate(peaks, Lifts(), scenes.fixed_count(1), None, scenes=4, seed=0)  # type: ignore[arg-type]
+    one, lifts = scenes.fixed_count(1), Lifts()
+    tried = success.tried(peaks, lifts, one, None, scenes=4, seed=0, others=0)  # type: ignore[arg-type]
+    found = rates.rates(*tried, others=0)
     assert found["grasp_success/gn"] == pytest.approx(5 / 9)
     assert found["grasp_success/gn_first"] == pytest.approx(2 / 4)
     assert (found["attempts"], found["scenes"]) == (9, 4)
@@ -199,7 +201,8 @@ def test_grasp_evaluation_writes_what_it_promises(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
     scorer = scorers.load_scorer(runs["grasp"])
-    values, tables = success.evaluate(scorer, engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3, others=2)
+    found, tables = success.tried(scorer, engine, CONFIG, Partial(tmp_path, {}), scenes=3, seed=3, others=2)
+    values = rates.rates(found, tables, others=2)
     assert values["attempts"] == sum(table.grasps for table in tables) >= 3 and values["scenes"] == 3
     assert sum(value for key, value in values.items() if key.startswith("table/")) == 3
     assert 0 <= values["other_grasps/ceiling"] <= 1
@@ -209,6 +212,6 @@ def test_grasp_evaluation_writes_what_it_promises(
 
 @pytest.mark.slow
 def test_labels_of_pretraining_mostly_agree_with_physics(engine: Any) -> None:
-    found = success.label_agreement(engine, scenes.fixed_count(1), scenes=16, seed=0)
+    found = rates.label_rates(success.labels_tried(engine, scenes.fixed_count(1), scenes=16, seed=0))
     assert found["grasps"] > 48 and 0.1 < found["positive"] < 0.9
     assert found["agree"] > 0.7

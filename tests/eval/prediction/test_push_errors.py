@@ -22,9 +22,10 @@ def test_prediction_measures_the_baselines_as_they_are(
     engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
     network = {"dipn": checkpoint.load_network(runs["dipn"], network="dipn")}
-    values, films = push_errors.evaluate(
+    rows, films = push_errors.measured(
         network, engine, CONFIG, Partial(tmp_path, {}), scenes=6, seed=3, physics=True, segmented=True
     )
+    values = push_errors.summary(rows)
     assert values["pushes"] == 6 and len(films["before"]) > 0
     # the engine with nominal mass and friction is nearer to the truth than nothing-moves
     assert values["push_error/physics/10cm/moved"] < values["push_error/static/10cm/moved"]

@@ -105,9 +105,10 @@ def test_masks_found_in_the_image_are_measured_by_themselves(
 
     monkeypatch.setattr(segment, "find", find)
     still = Slides(np.zeros(2, np.float32))
-    values, _ = push_errors.evaluate(
+    rows, _ = push_errors.measured(
         {}, still, CONFIG, Partial(tmp_path, {}), scenes=4, seed=0, physics=True, segmented=True
     )
+    values = push_errors.summary(rows)
     share = sum(lost) / values["objects"]
     assert 0.1 < share < 0.4 and len(lost) == values["pushes"] == 4
     for name in ("static", "physics"):

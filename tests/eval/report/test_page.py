@@ -32,9 +32,10 @@ def test_the_report_is_one_file_with_its_pictures(
     cleared: Any, engine: Any, runs: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
     network = {"dipn": checkpoint.load_network(runs["dipn"], network="dipn")}
-    values, films = push_errors.evaluate(
+    rows, films = push_errors.measured(
         network, engine, CONFIG, Partial(tmp_path, {}), scenes=2, seed=3, physics=False, segmented=False
     )
+    values = push_errors.summary(rows)
     (tmp_path / "p").mkdir()
     np.savez_compressed(tmp_path / "p" / "films.npz", **films)  # type: ignore[arg-type]
     metrics.write(tmp_path / "p", values, settings={})
