@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
 from benchmarks.harness import Figures
-from dipn_jax.commands import console
+from dipn_jax.commands import console, markdown
 from dipn_jax.system import files
 
 SETTINGS = "datagen_mjx.settings"
@@ -19,15 +19,11 @@ COLUMNS = ("time", "p50_mm", "p90_mm", "grasps_equal", "faults")
 """Columns of its table."""
 
 
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
 def tables(figures: Figures) -> str:
     """Return as Markdown ratios with their goals, episodes per second, and the cost of other settings of MJX."""
     goals = {known: benchmark.goal for known, benchmark in BENCHMARKS.items()}
     goals |= {known: stage.goal for known, stage in on_gpu.STAGES.items()}
-    ratios = [_row(["figure", "goal", "value"]), _row(["---"] * 3)]
+    ratios = []
     rates: dict[str, dict[int, float]] = {}
     variants: dict[str, dict[str, float]] = {}
     for name, value in figures.items():
@@ -40,15 +36,16 @@ def tables(figures: Figures) -> str:
             rates.setdefault(kind.replace("/", ", "), {})[int(count)] = value
         else:
             plain = name == base or name.rpartition("/")[2].isdigit()
-            ratios.append(_row([f"`{name}`", goals[base] if plain else "", f"{value:.3g}"]))
+            ratios.append([f"`{name}`", goals[base] if plain else "", f"{value:.3g}"])
     counts = sorted({count for row in rates.values() for count in row})
-    speeds = [_row(["episodes a second", *map(str, counts)]), _row(["---"] * (len(counts) + 1))]
-    for kind, row in rates.items():
-        speeds.append(_row([kind, *(f"{row[count]:.3g}" if count in row else "" for count in counts)]))
-    others = [_row(["MJX with", *COLUMNS]), _row(["---"] * (len(COLUMNS) + 1))]
-    for variant, found in variants.items():
-        others.append(_row([f"`{variant}`", *(f"{found[key]:.3g}" if key in found else "" for key in COLUMNS)]))
-    return "\n\n".join("\n".join(table) for table in (ratios, speeds, others) if len(table) > 2) + "\n"
+    speeds = [[kind, *(f"{row[count]:.3g}" if count in row else "" for count in counts)] for kind, row in rates.items()]
+    others = [
+        [f"`{variant}`", *(f"{found[key]:.3g}" if key in found else "" for key in COLUMNS)]
+        for variant, found in variants.items()
+    ]
+    heads = (["figure", "goal", "value"], ["episodes a second", *map(str, counts)], ["MJX with", *COLUMNS])
+    shown = zip(heads, (ratios, speeds, others), strict=True)
+    return "\n".join(markdown.table(head, rows) for head, rows in shown if rows)
 
 
 OTHERS = ("torch", "pybullet")
@@ -63,7 +60,7 @@ def origins(kept: dict[str, Any]) -> str:
     """
     machines = kept["machine"] if isinstance(kept["machine"], list) else [kept["machine"]]
     titles = ["figures", "machine", "commit", "versions", "scale", "seed"]
-    lines = [_row(titles), _row(["---"] * len(titles))]
+    rows = []
     for facts in machines:
         place = [facts["processor"], f"{facts['cores']} core{'s' * (facts['cores'] > 1)}"]
         place += [device for device in facts["devices"] if device != "cpu"]
@@ -71,8 +68,8 @@ def origins(kept: dict[str, Any]) -> str:
         shown |= {name: facts.get(name) for name in OTHERS}
         versions = [f"python {facts['python']}", *(f"{name} {found}" for name, found in shown.items() if found)]
         cells = [facts.get("rows", "all"), ", ".join(place), facts["commit"], ", ".join(versions)]
-        lines.append(_row([*cells, facts["scale"], str(facts["seed"])]))
-    return "\n".join(lines) + "\n"
+        rows.append([*cells, facts["scale"], str(facts["seed"])])
+    return markdown.table(titles, rows)
 
 
 def merged(paths: Sequence[pathlib.Path]) -> Figures:

@@ -7,7 +7,7 @@ import sys
 from typing import Any
 
 from benchmarks.page import origins
-from dipn_jax.commands import console
+from dipn_jax.commands import console, markdown
 from dipn_jax.system import files
 
 MILLION = 1_000_000
@@ -21,10 +21,6 @@ COLUMNS = {
     "manifest_bytes": "bytes a shard in the list",
 }
 """Figures of `jobs.overhead` and their titles."""
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows)) + "\n"
 
 
 def costs(kept: dict[str, Any]) -> str:
@@ -42,7 +38,7 @@ def costs(kept: dict[str, Any]) -> str:
             cells = [f"{rate:.3g}", f"{hours:.3g}", f"{hours / 100:.2g} h", f"{60 * hours / 10_000:.2g} min"]
             rows.append([kind, objects, *cells, f"{10_000 * rate / cores / SHARD:.3g}"])
     head = ["kind", "objects", f"episodes a second, {cores} cores", "core-hours a million", "on 100 cores"]
-    return _table([*head, "on 10,000 cores", "shards a second then"], rows)
+    return markdown.table([*head, "on 10,000 cores", "shards a second then"], rows)
 
 
 def overheads(kept: dict[str, Any]) -> str:
@@ -56,7 +52,7 @@ def overheads(kept: dict[str, Any]) -> str:
         [launcher, f"{int(count):,}", *(f"{row[key]:.3g}" for key in COLUMNS)]
         for (launcher, count), row in found.items()
     ]
-    return _table(["launcher", "shards", *COLUMNS.values()], rows)
+    return markdown.table(["launcher", "shards", *COLUMNS.values()], rows)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from dipn_jax import batching, seeds
-from dipn_jax.commands import console
+from dipn_jax.commands import console, markdown
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
@@ -124,12 +124,6 @@ def _sections(
     }
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    """Return a table as Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 class _Cells:
     """Figures as text for tables; empty where one is missing."""
 
@@ -158,7 +152,7 @@ def page(metrics: dict[str, Any]) -> str:
         *_camera_parts(cells),
         *_engine_parts(cells),
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
 def _drop_parts(cells: _Cells) -> list[str]:
@@ -183,9 +177,11 @@ def _drop_parts(cells: _Cells) -> list[str]:
     ]
     return [
         "## Drops",
-        _table(["engine", "objects", "tries", *columns], drops),
+        markdown.table(["engine", "objects", "tries", *columns], drops),
         "## Every catalogue item set down on every face that it can stand on",
-        _table(["engine", "tries", "at rest", "as put", "largest turn, degrees", "farthest from the table, mm"], rests),
+        markdown.table(
+            ["engine", "tries", "at rest", "as put", "largest turn, degrees", "farthest from the table, mm"], rests
+        ),
     ]
 
 
@@ -196,7 +192,7 @@ def _grasp_parts(cells: _Cells) -> list[str]:
     ]
     return [
         "## Grasps of single objects, centred and antipodal, off by up to 1 cm and 7.5 degrees",
-        _table(["item", "held", "tries"], rows),
+        markdown.table(["item", "held", "tries"], rows),
         f"Closing on the 100 mm side: {cells.share('grasp_too_wide/held')} held; one finger on top of an object of "
         f"2 kg: {cells.share('grasp_on_top/held')}; the same object, centred: {cells.share('grasp_heavy/held')}.",
     ]
@@ -207,10 +203,10 @@ def _push_parts(cells: _Cells) -> list[str]:
     sweeps = [[f"{k} cm", cells.pair(f"sweep/{k}cm", "mm"), cells.pair(f"sweep/{k}cm", "deg")] for k in (3, 5, 7)]
     return [
         f"## Pushes of 10 cm, {cells.number('push/moved_objects', '.0f')} objects moved",
-        _table(["what", "share"], pushed),
+        markdown.table(["what", "share"], pushed),
         f"Deepest contact at any centimetre, gripper included: {cells.number('push/depth_max_mm', '.2f')} mm.",
         "## A push of its own against the same centimetre of a longer one p50 / p90",
-        _table(["after", "mm", "degrees"], sweeps),
+        markdown.table(["after", "mm", "degrees"], sweeps),
     ]
 
 
@@ -236,5 +232,5 @@ def _engine_parts(cells: _Cells) -> list[str]:
     columns = [f"{c} cm, {u}" for c in (1, 5, 10) for u in ("mm", "deg")]
     return [
         "## Engines against `native` at 2 ms, objects that it moves: p50 / p90",
-        _table(["engine", "scenes", *columns, "grasps", "of them held", "equal", "unsettled"], rows),
+        markdown.table(["engine", "scenes", *columns, "grasps", "of them held", "equal", "unsettled"], rows),
     ]

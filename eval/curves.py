@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from dipn_jax.commands import markdown
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DIPN
 from dipn_jax.storage import checkpoint
@@ -191,7 +192,7 @@ def push_table(values: dict[str, Any], *, which: str = "all") -> str:
             cells.append(cell + spread)
         if any(cells):
             rows.append([label, *cells])
-    return _markdown(rows)
+    return markdown.table(rows[0], rows[1:])
 
 
 def grasp_table(values: dict[str, Any], counts: Sequence[int]) -> str:
@@ -203,10 +204,4 @@ def grasp_table(values: dict[str, Any], counts: Sequence[int]) -> str:
             at = f"online/{name}/{n}"
             cells.append(f"{values[at + '/mean']:.3f} ± {values[at + '/std']:.3f}" if f"{at}/mean" in values else "")
         rows.append([title, *cells])
-    return _markdown(rows)
-
-
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table; the first row is its head."""
-    lines = ["| " + " | ".join(row).lstrip() + " |" for row in rows]
-    return "\n".join([lines[0], "| --- " * len(rows[0]) + "|", *lines[1:]]) + "\n"
+    return markdown.table(rows[0], rows[1:])

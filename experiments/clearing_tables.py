@@ -10,6 +10,7 @@ from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import lockstep, sweeping
 from dipn_jax.eval.report import paper
 
+from dipn_jax.commands import markdown
 from dipn_jax.names import ALL_AIDS, MethodName
 from experiments import runs
 from experiments.kept import Kept
@@ -142,14 +143,13 @@ def _difference(values: dict[str, Any], at: str) -> str:
 
 def _table(values: dict[str, Any], head: str, rows: dict[str, str]) -> str:
     """Return a table of the groups `rows`, title by name, as far as they are there."""
-    lines = [f"| {head} | tables | pushes | " + " | ".join(TITLES.values()) + " | efficiency, difference |"]
-    lines.append("| --- " * (len(TITLES) + 4) + "|")
+    lines = []
     for at, title in rows.items():
         if f"{at}/tables" in values:
             cells = [str(values[f"{at}/tables"]), str(values[f"{at}/pushes"])]
             cells += [_cell(values, f"{at}/{key}") for key in TITLES]
-            lines.append(f"| {title} | {' | '.join(cells)} | {_difference(values, f'{at}/efficiency_all')} |")
-    return "\n".join(lines) + "\n"
+            lines.append([title, *cells, _difference(values, f"{at}/efficiency_all")])
+    return markdown.table([head, "tables", "pushes", *TITLES.values(), "efficiency, difference"], lines)
 
 
 PUSH_OR_NOT = ("gn", "dipn+gn+actions")
@@ -227,13 +227,12 @@ def _named(values: dict[str, Any], kind: str) -> dict[str, str]:
 
 def swept(values: dict[str, Any]) -> str:
     """Return a table of what `dipn-eval sweep` found at each distance; errors are true 1-IoU of moved objects."""
-    lines = ["| push | error, moved objects | completion | grasp success | efficiency | pushes |", "| --- " * 6 + "|"]
+    rows = []
     for each in sweeping.names(values):
         at = f"sweep/{each}"
         error = values.get(f"{at}/push_error/moved")
         name = each if error is None else f"{100 * float(each):.0f} cm"
         cells = [_cell(values, f"{at}/{key}") for key in sweeping.SHOWN]
-        lines.append(
-            f"| {name} | {'-' if error is None else f'{error:.3f}'} | {' | '.join(cells)} | {values[f'{at}/pushes']} |"
-        )
-    return "\n".join(lines) + "\n"
+        rows.append([name, "-" if error is None else f"{error:.3f}", *cells, str(values[f"{at}/pushes"])])
+    head = ["push", "error, moved objects", "completion", "grasp success", "efficiency", "pushes"]
+    return markdown.table(head, rows)

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from dipn_jax.commands import markdown
 from dipn_jax.errors import UserError
 from dipn_jax.system import files
 from experiments import command, pages
@@ -67,11 +68,6 @@ TABLES = {"hard": "the ten hard instances, once each", "random-10": "random, 10 
 """Rows of the table of cleared tables, and their titles."""
 
 
-def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [titles, ["---"] * len(titles), *rows]
-    return "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
-
-
 def _share(values: dict[str, Any], key: str) -> str:
     """A share with its interval, in per cent."""
     return f"{100 * values[key]:.1f} [{100 * values[f'{key}_low']:.0f}, {100 * values[f'{key}_high']:.0f}]"
@@ -103,9 +99,9 @@ def tables(values: dict[str, Any]) -> list[str]:
     grasps_on = f"grasps on {values['scenes']} unseen tables of 10 objects"
     headings = ["tables", "completion", "grasp success, all", "efficiency, all", "pushes"]
     return [
-        _table([errors_of, "5 cm, all objects", "5 cm, moved", "10 cm, all", "10 cm, moved"], errors),
-        _table([grasps_on, "success %"], grasps),
-        _table(["clearing with Alg. 2, %", *headings], cleared),
+        markdown.table([errors_of, "5 cm, all objects", "5 cm, moved", "10 cm, all", "10 cm, moved"], errors),
+        markdown.table([grasps_on, "success %"], grasps),
+        markdown.table(["clearing with Alg. 2, %", *headings], cleared),
     ]
 
 

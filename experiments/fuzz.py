@@ -25,7 +25,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax.commands import console
+from dipn_jax.commands import console, markdown
 from dipn_jax.errors import UserError
 from dipn_jax.system import files, machine
 from experiments import fuzz_parsers, pages
@@ -94,11 +94,8 @@ def table(values: dict[str, Any]) -> str:
     Args:
       values: parser -> its counts, as the file of results has them.
     """
-    lines = ["| parser | inputs | accepted | refused in one line | tracebacks |", "| --- | --- | --- | --- | --- |"]
-    for name, found in values.items():
-        cells = [f"{found[key]:,}" for key in ("inputs", *OUTCOMES)]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    rows = [[name, *(f"{found[key]:,}" for key in ("inputs", *OUTCOMES))] for name, found in values.items()]
+    return markdown.table(["parser", "inputs", "accepted", "refused in one line", "tracebacks"], rows)
 
 
 def write(path: pathlib.Path, found: dict[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from typing import Any
 
 from dipn_jax.eval import curves
 
+from dipn_jax.commands import markdown
 from dipn_jax.system import files
 from experiments import command, pages
 from experiments.runs import Recipe, Run
@@ -106,7 +107,7 @@ RATES = {"gn": "GN, until the table is empty", "gn_first": "GN, first grasp", "r
 def success_table(values: dict[str, Any]) -> str:
     """Return a table of the shipped network's success, with 95 % intervals, and what physics allows."""
     titles = [*RATES.values(), "tables", "grasps", "tables emptied", "best case", "ECE"]
-    lines = ["| | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
+    rows = []
     for row, title in ROWS.items():
         if f"{row}/attempts" not in values:
             continue
@@ -118,16 +119,16 @@ def success_table(values: dict[str, Any]) -> str:
         best_case = values.get(f"{row}/other_grasps/ceiling")
         cells += ["" if best_case is None else f"{100 * best_case:.1f} %"]
         cells += [f"{values[f'{row}/expected_calibration_error']:.3f}"]
-        lines.append(f"| {title} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        rows.append([title, *cells])
+    return markdown.table(["", *titles], rows)
 
 
 def label_table(values: dict[str, Any]) -> str:
     """Return a table of how far the labels of pre-training agree with physics, on single objects."""
     at = "builtin-10/labels_of_single_objects"
-    lines = ["| random grasps | agree | positives that hold | negatives that fail |", "| --- | --- | --- | --- |"]
     shares = [f"{100 * values[f'{at}/{key}']:.0f} %" for key in ("agree", "positive_holds", "negative_fails")]
-    return "\n".join([*lines, f"| {values[f'{at}/grasps']} | " + " | ".join(shares) + " |"]) + "\n"
+    head = ["random grasps", "agree", "positives that hold", "negatives that fail"]
+    return markdown.table(head, [[str(values[f"{at}/grasps"]), *shares]])
 
 
 def tables(values: dict[str, Any]) -> list[str]:

@@ -17,7 +17,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-from dipn_jax.commands import console
+from dipn_jax.commands import console, markdown
 from dipn_jax.errors import UserError
 from dipn_jax.system import files
 from experiments import mutants_session, pages
@@ -56,7 +56,6 @@ TESTS: dict[str, tuple[str, ...]] = {
 
 PAGE = "testing"
 """Name of the page in docs and of its JSON."""
-_HEADING = ("| module | mutants | killed | survivors |", "| --- | --- | --- | --- |")
 
 
 def section(values: dict[str, Any]) -> str:
@@ -65,16 +64,16 @@ def section(values: dict[str, Any]) -> str:
     Args:
       values: module -> its `mutants_session.result`; a module that is missing was not measured.
     """
-    lines = [*_HEADING]
+    rows = []
     for module in TESTS:
         if found := values.get(module):
             share = 100 * found["killed"] / max(found["mutants"], 1)
-            lines.append(
-                f"| `{module}` | {found['mutants']} | {found['killed']} ({share:.1f} %) | {len(found['survivors'])} |"
-            )
+            killed = f"{found['killed']} ({share:.1f} %)"
+            rows.append([f"`{module}`", str(found["mutants"]), killed, str(len(found["survivors"]))])
+    text = markdown.table(["module", "mutants", "killed", "survivors"], rows)
     if missing := [f"`{module}`" for module in TESTS if module not in values]:
-        lines += ["", *textwrap.wrap(f"Not measured yet: {', '.join(missing)}.", 120, break_on_hyphens=False)]
-    return "\n".join(lines) + "\n"
+        text += "\n" + textwrap.fill(f"Not measured yet: {', '.join(missing)}.", 120, break_on_hyphens=False) + "\n"
+    return text
 
 
 def write_page(values: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:

@@ -24,7 +24,7 @@ from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.clearing.on_tables import Recall, TablePolicy
 from dipn_jax.eval.clearing.tables import Tables
 
-from dipn_jax.commands import console
+from dipn_jax.commands import console, markdown
 from dipn_jax.engine import Engine
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import outlook, scorers
@@ -128,15 +128,14 @@ LIMITS = (0.0, 1.0, 1.5, 2.0, 2.2, 2.4, 2.6, 3.0)
 
 def table(rows: dict[str, list[dict[str, Any]]]) -> str:
     """Return a table of what pushes save in all, by the shortfall or the rise of the mean from which they are made."""
-    lines = ["| pushed where | " + " | ".join(f"{name}: pushes, actions saved" for name in rows) + " |"]
-    lines.append("| --- " * (len(rows) + 1) + "|")
+    lines = []
     for limit in LIMITS:
         cells = [_saved([row for row in found if row["shortfall"] > limit]) for found in rows.values()]
-        lines.append(f"| shortfall over {limit:.1f} | {' | '.join(cells)} |")
+        lines.append([f"shortfall over {limit:.1f}", *cells])
     for ratio in (1 / 0.9, 2.0, 3.0, 4.0):
         cells = [_saved([row for row in found if (row["mean_ratio"] or 0) > ratio]) for found in rows.values()]
-        lines.append(f"| mean score rises by a factor over {ratio:.2f} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        lines.append([f"mean score rises by a factor over {ratio:.2f}", *cells])
+    return markdown.table(["pushed where", *(f"{name}: pushes, actions saved" for name in rows)], lines)
 
 
 def _saved(rows: Sequence[dict[str, Any]]) -> str:

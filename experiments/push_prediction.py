@@ -18,6 +18,7 @@ from typing import Any
 
 from dipn_jax.eval import curves
 
+from dipn_jax.commands import markdown
 from dipn_jax.system import files
 from dipn_jax.world import shapes
 from experiments import command, pages
@@ -106,14 +107,14 @@ TITLES = [f"{at.replace('cm', ' cm')}, {which}" for at, which in COLUMNS]
 
 def shift_table(values: dict[str, Any]) -> str:
     """Return a table of the shipped network, the best case and a baseline in worlds unlike the training data."""
-    lines = ["| scenes | predictor | " + " | ".join(TITLES) + " |", "| --- " * (len(TITLES) + 2) + "|"]
+    rows = []
     for shift, title in SHIFTS.items():
         for name in ("dipn", "physics", "trans"):
             keys = [f"{shift}/push_error/{name}/{at}/{which}" for at, which in COLUMNS]
             if all(key in values for key in keys):
                 cells = [f"{values[key]:.3f}" for key in keys]
-                lines.append(f"| {title} | {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+                rows.append([title, name, *cells])
+    return markdown.table(["scenes", "predictor", *TITLES], rows)
 
 
 def alone_table(values: dict[str, Any]) -> str:
@@ -122,19 +123,19 @@ def alone_table(values: dict[str, Any]) -> str:
     names["found"] = "1 to 10 cm, trained on masks found in the image"
     columns = [(f"push_error{masks}", at, which) for masks in ("", "_segmented") for at, which in COLUMNS]
     titles = [f"{title}{end}" for end in ("", ", found masks") for title in TITLES]
-    lines = ["| network | " + " | ".join(titles) + " |", "| --- " * (len(titles) + 1) + "|"]
+    rows = []
     for name, title in names.items():
         cells = []
         for measure, at, which in columns:
             asked = not name.startswith("only") or at == f"{name.removeprefix('only')}cm"
             cells.append(f"{values[f'alone-{name}/{measure}/dipn/{at}/{which}']:.3f}" if asked else "")
-        lines.append(f"| {title} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        rows.append([title, *cells])
+    return markdown.table(["network", *titles], rows)
 
 
 def unseen_table(values: dict[str, Any]) -> str:
     """Return a table on scenes of one class of shapes: a network trained without the class, and one with all."""
-    lines = ["| shapes | predictor | " + " | ".join(TITLES) + " |", "| --- " * (len(TITLES) + 2) + "|"]
+    rows = []
     predictors = {
         "DIPN, never shown them": ("without", "dipn"),
         "DIPN, shown all": ("with", "dipn"),
@@ -145,13 +146,13 @@ def unseen_table(values: dict[str, Any]) -> str:
         for title, (folder, predictor) in predictors.items():
             keys = [f"{folder}-{name}/push_error/{predictor}/{at}/{which}" for at, which in COLUMNS]
             cells = [f"{values[key]:.3f}" for key in keys]
-            lines.append(f"| {name.replace('_', ' ')} | {title} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+            rows.append([name.replace("_", " "), title, *cells])
+    return markdown.table(["shapes", "predictor", *TITLES], rows)
 
 
 def crowd_table(values: dict[str, Any]) -> str:
     """Return a table on scenes of 8 to 15 objects: networks trained on such scenes, and on 1 to 7."""
-    lines = ["| trained on | " + " | ".join(TITLES) + " |", "| --- " * (len(TITLES) + 1) + "|"]
+    rows = []
     trained = {
         "crowd-few": "1,500 pushes, 1 to 7 objects",
         "crowd-crowded": "1,500 pushes, 8 to 15 objects",
@@ -159,8 +160,8 @@ def crowd_table(values: dict[str, Any]) -> str:
     }
     for folder, title in trained.items():
         cells = [f"{values[f'{folder}/push_error/dipn/{at}/{which}']:.3f}" for at, which in COLUMNS]
-        lines.append(f"| {title} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        rows.append([title, *cells])
+    return markdown.table(["trained on", *TITLES], rows)
 
 
 GOALS = [
@@ -185,14 +186,14 @@ GOALS = [
 
 def goal_table(values: dict[str, Any]) -> str:
     """Return a table of the goals and what was measured."""
-    lines = ["| figure | 5 cm, goal | 5 cm | 10 cm, goal | 10 cm |", "| --- | --- | --- | --- | --- |"]
+    rows = []
     for title, key, over, goals in GOALS:
         cells = []
         for at, goal in zip(("5cm", "10cm"), goals, strict=True):
             level = min(values[f"push_error/{name}/{at}/moved"] for name in ("trans", "static")) if over else 1.0
             cells += [f"<= {goal:.2f}", f"{values[key.format(at)] / level:.3f}"]
-        lines.append(f"| {title} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        rows.append([title, *cells])
+    return markdown.table(["figure", "5 cm, goal", "5 cm", "10 cm, goal", "10 cm"], rows)
 
 
 def tables(values: dict[str, Any]) -> list[str]:

@@ -18,7 +18,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from dipn_jax.commands import console
+from dipn_jax.commands import console, markdown
 from dipn_jax.errors import UserError
 from dipn_jax.system import files
 from experiments import pages
@@ -187,11 +187,11 @@ def section(values: dict[str, Any]) -> str:
             paragraphs.append(f"Tried: {promise.counted(values)}.")
     wrapped = [textwrap.fill(each, 120, break_long_words=False, break_on_hyphens=False) for each in paragraphs]
     columns = ("tried", "lost", "repeated", "wrong", "damaged", "tracebacks")
-    rows = [f"| command | fault | {' | '.join(columns)} |", f"| --- | --- |{' --- |' * len(columns)}"]
+    rows = []
     for case, kinds in cases_of(values).items():
         for kind, row in kinds.items():
-            rows.append(f"| {case} | {kind} | {' | '.join(str(row[name]) for name in columns)} |")
-    return "\n\n".join([*wrapped, "## Faults by command", "\n".join(rows)]) + "\n"
+            rows.append([case, kind, *(str(row[name]) for name in columns)])
+    return "\n\n".join([*wrapped, "## Faults by command", markdown.table(["command", "fault", *columns], rows)])
 
 
 def write(key: str, found: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
+from dipn_jax.commands import markdown
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, records
 from dipn_jax.system import files, typed
@@ -62,7 +63,7 @@ def card(source: Source, form: str, images: str, command: Sequence[str]) -> str:
         "of the workspace has its origin at the centre of the square of 0.448 m on the table, z up, angles from +x "
         "toward +y. Maps are indexed `[row, col]`, 2 mm a pixel, rows along +y and columns along +x.\n",
         f"## Files\n\n{_LAYOUTS[form]}\n",
-        _table(["split", "episodes"], [[split, str(len(source.episodes(split)))] for split in SPLITS]),
+        markdown.table(["split", "episodes"], [[split, str(len(source.episodes(split)))] for split in SPLITS]),
         "`test` is what `dipn-train` holds out of the same data set: about the last tenth, 1,000 at most. No scene is "
         "in both splits.\n",
         *_schema(source, form, images),
@@ -102,12 +103,7 @@ def _columns(columns: Sequence[Column], slots: int, *, flat: bool) -> str:
         [f"`{c.flat_name if flat else c.name}`", c.dtype, str(list(c.lengths(slots))) if c.shape else "", c.meaning]
         for c in columns
     ]
-    return _table(["name", "type", "shape", "meaning"], rows)
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return markdown.table(["name", "type", "shape", "meaning"], rows)
 
 
 def _origin(source: Source, command: Sequence[str]) -> list[str]:
