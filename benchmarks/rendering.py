@@ -77,10 +77,10 @@ def vs_raycast(setting: Setting) -> Iterator[tuple[str, float]]:
     yield "render.vs_raycast", theirs / mine
 
 
-def times(seed: int, batch: int, *, repeats: int, objects: int = OBJECTS) -> tuple[float, float]:
+def times(seed: int, batch: int, *, repeats: int) -> tuple[float, float]:
     """Measure seconds of the renderer and of the ray caster for images of `batch` scenes."""
     key = jax.random.key(seed)
-    items = clutter.settled_scenes(key, make_engine("native"), scenes.fixed_count(objects), batch)
+    items = clutter.settled_scenes(key, make_engine("native"), scenes.fixed_count(OBJECTS), batch)
     caster = RayCaster(items)
     scene: Scene = jax.tree.map(jax.numpy.asarray, items.scene)
     poses = jax.numpy.asarray(items.poses)

@@ -66,7 +66,7 @@ def _rollouts(native: Engine, count: int, tries: int, seed: int) -> Iterator[tup
 def needs(engine: WarpEngine, scene: Scene, rollout: Rollout) -> np.ndarray:
     """Return how many of `NEEDS` there are `[B S, 3]` in each state of rollouts of `scene [B, N]`."""
     batch, states = rollout.poses.shape[:2]
-    packed, slots = hosted.pack(structs.take(scene, np.repeat(np.arange(batch), states)), np.asarray(0))
+    packed, slots = hosted.pack(structs.take(scene, np.repeat(np.arange(batch), states)))
     poses, hand = (leaf.reshape(batch * states, *leaf.shape[2:]) for leaf in (rollout.poses, rollout.gripper))
     bodies = np.take_along_axis(poses, slots[..., None], 1).reshape(len(poses), -1)
     hand = np.concatenate([hand[:, :4], hand[:, 4:] / 2, hand[:, 4:] / 2], -1)

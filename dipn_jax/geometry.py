@@ -148,7 +148,7 @@ def rotate_map(
 
 
 def unrotate_map(
-    image: Shaped[Array, "H W *c"], angle: Float[Array, ""] | float, size: int, fill: float | int = 0
+    image: Shaped[Array, "H W *c"], angle: Float[Array, ""] | float, size: int
 ) -> Shaped[jax.Array, "{size} {size} *c"]:
-    """Undo `rotate_map`."""
-    return rotate_map(image, -angle, size, fill)
+    """Return an image turned back: the inverse of `rotate_map`, 0 beyond its border."""
+    return rotate_map(image, -angle, size)

@@ -137,7 +137,7 @@ class Watch:
         return np.asarray(codes)
 
 
-def pack(scenes: Scene, poses: np.ndarray) -> tuple[Scene, np.ndarray]:
+def pack(scenes: Scene) -> tuple[Scene, np.ndarray]:
     """Return scenes with present objects first and only the slots that the fullest scene needs, and which `[B, n]`."""
     present = scenes.shape >= 0
     n = max(1, int(present.sum(-1).max()))

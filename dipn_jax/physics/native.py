@@ -62,7 +62,7 @@ class NativeEngine:
         """See `Engine.simulate`; takes arrays of any kind, returns NumPy arrays."""
         scenes, trajectories = jax.tree.map(np.asarray, (scenes, trajectories))
         poses = np.asarray(poses)
-        packed, slots = hosted.pack(scenes, poses)
+        packed, slots = hosted.pack(scenes)
         with self._building:
             models = self._compile(packed)
         dropped = settle and fence > 0 and self.config.falling_timestep

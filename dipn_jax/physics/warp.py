@@ -141,7 +141,7 @@ class WarpEngine:
         self, scenes: Scene, poses: np.ndarray, paths: Trajectory, instants: np.ndarray, settle: bool, fence: float
     ) -> tuple[Rollout, np.ndarray]:
         """Return the rollout of at most `chunk` scenes, and how often the solver took each number of iterations."""
-        packed, slots = hosted.pack(scenes, poses)
+        packed, slots = hosted.pack(scenes)
         present = np.asarray(packed.shape >= 0)
         start = np.where(present[..., None], np.take_along_axis(poses, slots[..., None], 1), parked(present.shape[1]))
         qpos = np.concatenate([hosted.controls(paths, np.zeros(1))[0], start.reshape(len(start), -1)], -1)

@@ -28,6 +28,8 @@ MIN_GRIP_DEPTH = 0.015
 LOW_OBJECT_RAISE = 0.004
 """Metres by which fingertips may stop short over an object that is too low for MIN_GRIP_DEPTH."""
 
+APART_PIXELS = 8.0
+"""Smallest distance in pixels between the centres of the best grasps, where several are wanted."""
 SAME_GRASP_PIXELS = 10.0
 """Largest distance in pixels between the centres of two grasps that count as the same grasp."""
 SAME_GRASP_ROTATIONS = 1
@@ -218,17 +220,17 @@ def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) ->
     return jnp.minimum(scores, scores * 0.5**count)
 
 
-def without(scores: Float[Array, "R H W"], grasp: Int[Array, " 3"], *, apart: float = 8.0) -> Float[jax.Array, "R H W"]:
-    """Return the scores with -1 for all grasps that are less than `apart` pixels from a grasp `[3]`."""
+def without(scores: Float[Array, "R H W"], grasp: Int[Array, " 3"]) -> Float[jax.Array, "R H W"]:
+    """Return the scores with -1 for all grasps that are less than APART_PIXELS from a grasp `[3]`."""
     away = geometry.view_grid(*scores.shape[1:]) - jnp.asarray(grasp)[::-1][:2]
-    return jnp.where(jnp.linalg.norm(away, axis=-1) < apart, -1.0, scores)
+    return jnp.where(jnp.linalg.norm(away, axis=-1) < APART_PIXELS, -1.0, scores)
 
 
-def best_grasps(scores: Float[Array, "R H W"], *, count: int, apart: float = 8.0) -> Int[jax.Array, "{count} 3"]:
-    """Return the `count` best grasps by score, at least `apart` pixels from one another."""
+def best_grasps(scores: Float[Array, "R H W"], *, count: int) -> Int[jax.Array, "{count} 3"]:
+    """Return the `count` best grasps by score, at least APART_PIXELS from one another."""
 
     def next_best(left: Array, _: None) -> tuple[Array, jax.Array]:
         index = best_grasp(left)[0]
-        return without(left, index, apart=apart), index
+        return without(left, index), index
 
     return jax.lax.scan(next_best, scores, None, length=count)[1]

@@ -78,7 +78,7 @@ def both(tables: Any) -> Any:
             super().__init__(*args)
             kept.append(self)
 
-    packed, slots = hosted.pack(scene, poses)
+    packed, slots = hosted.pack(scene)
     start = np.take_along_axis(poses, slots[..., None], 1)
     start = np.where(packed.shape[..., None] >= 0, start, warp.parked(start.shape[1]))
     sims = Stepped(worlds, np.concatenate([hosted.controls(paths, np.zeros(1))[0], start.reshape(len(start), -1)], -1))
