@@ -162,7 +162,7 @@ def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
     Empty if nothing is known of any.
     """
     rows = {
-        f"table/{on}/{budget}/{aids}/{method}": f"{method}, {budget}"
+        (at := f"table/{on}/{budget}/{aids}/{method}"): f"{method}, {budget}{_trainings(values, at)}"
         for budget in ("shipped", "large", "paper")
         for method in get_args(MethodName)
     }
@@ -176,6 +176,12 @@ def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
         cells = [f"{found[key]:.1f}" if key in found else "" for key in TITLES]
         text += f"| *{method}, the paper* | | | {' | '.join(cells)} | |\n"
     return text
+
+
+def _trainings(values: dict[str, Any], at: str) -> str:
+    """Return how many trainings a row is of, in parentheses; empty for the networks that come with the package."""
+    number = 0 if "/shipped/" in at else values.get(f"{at}/trainings", 0)
+    return f" ({number} training{'s' * (number > 1)})" if number else ""
 
 
 SECTIONS = {

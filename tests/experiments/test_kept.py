@@ -101,13 +101,13 @@ def test_numbers_of_several_trainings_and_differences(tmp_path: pathlib.Path) ->
     assert values[f"{other}/efficiency_all_less"] == pytest.approx(40 / 100 - 40 / 50)
     assert values[f"{other}/efficiency_all_less_high"] < 0 and f"{at}/efficiency_all_less" not in values
     text = clearing_tables.of_methods(values, "hard", "all")
-    assert "| dipn+gn, paper | 8 | 0 | 100.0 [100, 100] (0.0) |" in text and "| **-40.0** [" in text
+    assert "| dipn+gn, paper (2 trainings) | 8 | 0 | 100.0 [100, 100] (0.0) |" in text and "| **-40.0** [" in text
 
 
 def test_a_difference_that_may_be_nothing_is_not_bold(tmp_path: pathlib.Path) -> None:
     rows = {"table/hard/paper/all/dipn+gn/0": [5, 9, 5, 9], "table/hard/paper/all/gn/0": [9, 5, 9, 5]}
     text = clearing_tables.of_methods(clearing_tables.numbers(*_kept(tmp_path, rows)), "hard", "all")
-    assert "+0.0 [" in text and "**" not in text
+    assert "+0.0 [" in text and "**" not in text and "| gn, paper (1 training) |" in text
 
 
 def test_hindsight_chooses_the_better_table_by_table(tmp_path: pathlib.Path) -> None:
