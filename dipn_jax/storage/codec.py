@@ -89,18 +89,27 @@ def _last(poses: np.ndarray, after: np.ndarray) -> np.ndarray:
     return poses[:, -1] if poses.ndim > after.ndim else poses
 
 
-def decode(stored: Columns, specs: dict[str, dict[str, Any]]) -> Columns:
+def decode(stored: Columns, specs: dict[str, dict[str, Any]], *, into: Columns | None = None) -> Columns:
     """Return the inverse of `encode`; quantized columns become float32.
 
     It also knows the code `delta` of shards of version 2: differences along the second axis.
+
+    Args:
+      stored: columns as `encode` returns them.
+      specs: how to decode them.
+      into: arrays that the columns are written to, of the same shapes; new ones if not given.
     """
-    columns = {name: value.astype(np.int64) if name in specs else value for name, value in stored.items()}
+    columns = dict(stored)
     if specs.get("poses", {}).get("code") == "delta":
-        columns["poses"] = np.cumsum(columns["poses"], axis=1)
+        columns["poses"] = np.cumsum(columns["poses"], axis=1, dtype=np.int64)
     if specs.get("after", {}).get("code") == "from poses":
-        columns["after"] = columns["after"] + _last(columns["poses"], columns["after"])
+        columns["after"] = columns["after"].astype(np.int64) + _last(columns["poses"], columns["after"])
     for name, spec in specs.items():
-        columns[name] = (columns[name] * spec["quantum"]).astype(np.float32)
+        decoded = into[name] if into else np.empty(columns[name].shape, np.float32)
+        # in double precision, a few numbers at a time
+        columns[name] = np.multiply(columns[name], spec["quantum"], out=decoded, dtype=np.float64, casting="same_kind")
+    for name in (into or {}).keys() - specs.keys():
+        into[name][:] = columns[name]  # type: ignore[index]
     return columns
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from dipn_jax import structs
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, manifest, mirror, shards
@@ -193,17 +194,9 @@ def _joined(counts: dict[pathlib.Path, int], *, kind: str) -> Any:
     (path, *_), ends = counts, np.cumsum(list(counts.values()))
     first = shards.read_shard(path, kind=kind)
     whole = jax.tree.map(lambda leaf: np.empty((ends[-1], *leaf.shape[1:]), leaf.dtype), first)
-    slots = first.scene.shape.shape[1]
 
     def put(path: pathlib.Path, end: int) -> None:
-        part = shards.read_shard(path, kind=kind)
-        if (its := part.scene.shape.shape[1]) != slots:
-            few, many = sorted((slots, its))
-            raise UserError(
-                f"data set {path.parent}: shards with {few} and {many} object slots; want one number in a folder"
-            )
-        for leaf, read in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
-            leaf[end - counts[path] : end] = read
+        shards.read_shard(path, kind=kind, into=structs.take(whole, slice(end - counts[path], end)))
         progress.advance(1)
 
     progress = console.Progress(f"read {kind}", len(counts), unit="shards", quiet=len(counts) < PROGRESS_SHARDS)

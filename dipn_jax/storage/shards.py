@@ -174,17 +174,28 @@ def count(path: pathlib.Path) -> int:
     return int(read_meta(path)["episodes"])
 
 
-def read_shard(path: pathlib.Path, *, kind: str) -> Any:
+def read_shard(path: pathlib.Path, *, kind: str, into: Any = None) -> Any:
     """Return the episodes of a shard: a struct of `KINDS[kind]` with a leading `[B]` axis, NumPy arrays.
 
+    Args:
+      path: the file.
+      kind: of its episodes.
+      into: a struct like the result, whose arrays the episodes are written to; new ones if not given.
+
     Raises:
-      UserError: see `read_meta`; or the shard is of another kind.
+      UserError: see `read_meta`; or the shard is of another kind, or has another number of object slots than `into`.
     """
     meta = read_meta(path)
     if meta["kind"] != kind:
         raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
+    slots = meta["columns"]["scene.shape"]["shape"][0]
+    if into is not None and slots != into.scene.shape.shape[1]:
+        few, many = sorted((slots, into.scene.shape.shape[1]))
+        raise UserError(
+            f"data set {path.parent}: shards with {few} and {many} object slots; want one number in a folder"
+        )
     with _reading(path):
-        return codec.assemble(KINDS[kind], _decoded(path, meta, meta["columns"]))
+        return codec.assemble(KINDS[kind], _decoded(path, meta, meta["columns"], into=into))
 
 
 def read_sizes(path: pathlib.Path) -> np.ndarray:
@@ -198,15 +209,18 @@ def read_sizes(path: pathlib.Path) -> np.ndarray:
         return _decoded(path, meta, ["scene.size"])["scene.size"]
 
 
-def _decoded(path: pathlib.Path, meta: dict[str, Any], names: Iterable[str]) -> codec.Columns:
+def _decoded(path: pathlib.Path, meta: dict[str, Any], names: Iterable[str], *, into: Any = None) -> codec.Columns:
     """Return columns `[B, ...]` of a shard; one that is stored as a difference has to be among them with the other."""
     specs = {name: meta["columns"][name] for name in names}
-    table, columns = pq.read_table(path, columns=list(specs), page_checksum_verification=True), {}
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        table = file.read(list(specs), use_threads=False)  # those who read many shards have threads of their own
+    columns = {}
     for name, spec in specs.items():
         column = table.column(name).combine_chunks()
         flat = column.flatten()
         if column.null_count or flat.null_count:
             raise DamagedShard(path, f"its column {name} has empty places")
-        values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"])
+        values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"], copy="quantum" not in spec)
         columns[name] = values.reshape(meta["episodes"], *spec["shape"])
-    return codec.decode(columns, {name: spec for name, spec in specs.items() if "quantum" in spec})
+    coded = {name: spec for name, spec in specs.items() if "quantum" in spec}
+    return codec.decode(columns, coded, into=codec.columns(into) if into is not None else None)
