@@ -27,8 +27,8 @@ MEASURES = (*paper.COLUMNS[:1], "grasps_that_held", "grasp_success_all", "effici
 TITLES = {
     "completion": "completion",
     "grasps_that_held": "grasps that held",
-    "grasp_success_all": "objects a grasp",
-    "efficiency_all": "objects an action",
+    "grasp_success_all": "objects per grasp",
+    "efficiency_all": "objects per action",
 }
 """Titles of the measures."""
 

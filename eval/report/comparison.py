@@ -183,7 +183,7 @@ def _courses(rows: list[Cleared]) -> Any:
 
 
 def _films(one: Cleared) -> Any:
-    """Draw filmstrips of the best, median and worst table, by how many objects an action removed."""
+    """Draw filmstrips of the best, median and worst table, by objects per action."""
 
     def quality(entry: dict[str, Any]) -> tuple[bool, float]:
         return entry["ended"] == "cleared", entry["removed"] / max(entry["grasps"] + entry["pushes"], 1)
