@@ -8,6 +8,7 @@ from typing import Any
 
 from dipn_jax.commands import console
 from dipn_jax.names import EngineName
+from dipn_jax.system import files
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
 from .configs import BaselineConfig, OnlineConfig
@@ -124,3 +125,4 @@ def _check(out: pathlib.Path, config: OnlineConfig | BaselineConfig) -> None:
     console.require_between(0, 1, weight_decay=config.weight_decay)
     console.require_seed(config.seed)
     console.require_out(out)
+    files.require_locale(out)

@@ -11,6 +11,7 @@ import tyro
 
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
+from dipn_jax.system import files
 
 Preset = Literal["compact", "paper"]
 """Architecture of a network: ours, or as published."""
@@ -131,6 +132,7 @@ def check(config: TrainConfig, compute: Compute, out: pathlib.Path, *, data_sets
         )
     check_mix(config, data_sets=data_sets)
     console.require_out(out)
+    files.require_locale(out)
 
 
 def check_mix(config: TrainConfig, *, data_sets: int) -> None:

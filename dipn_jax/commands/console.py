@@ -5,9 +5,7 @@ The only module of the library that prints. Importing it imports no JAX, so that
 
 from __future__ import annotations
 
-import codecs
 import inspect
-import io
 import itertools
 import math
 import os
@@ -16,13 +14,14 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from dipn_jax.commands import option_paths
+from dipn_jax.commands import option_paths, surroundings
 from dipn_jax.errors import UserError
 from dipn_jax.system import addresses, files
 from dipn_jax.system.interruption import stops
@@ -42,6 +41,8 @@ def enable_compilation_cache() -> None:
     # on some processors XLA logs an error for every program that it finds in the cache, though it runs them (openxla
     # issue 44565); it reads this variable when JAX is first imported
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # a cache that cannot be read or written, as a full disk's, costs time only; JAX would say so for every program
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
     home = files.cache()
     if home is None:  # as in some containers: nothing is kept
         return
@@ -52,6 +53,14 @@ def enable_compilation_cache() -> None:
             sys.modules["jax"].config.update(name, value)
         else:
             os.environ[name.upper()] = str(value)
+
+
+def prepare() -> None:
+    """Make streams, environment and cache what commands need; one line says which settings of JAX are ignored."""
+    surroundings.open_streams()
+    if ignored := surroundings.settle():
+        warn(ignored)
+    enable_compilation_cache()
 
 
 class Progress:
@@ -116,13 +125,6 @@ class Progress:
             file=sys.stderr,
             flush=True,
         )
-
-
-def _use_utf8() -> None:
-    """Let output be UTF-8 where the locale knows ASCII only; names of files keep the bytes that they have."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper) and codecs.lookup(stream.encoding).name == "ascii":
-            stream.reconfigure(encoding="utf-8", errors="surrogateescape")
 
 
 def say(text: str) -> None:
@@ -199,8 +201,7 @@ def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | N
     Returns:
       The exit code, as `exit_code`.
     """
-    _use_utf8()
-    enable_compilation_cache()
+    prepare()
     return exit_code(lambda: _parse_and_call(description, commands, sys.argv[1:] if arguments is None else arguments))
 
 
@@ -223,39 +224,25 @@ def exit_code(work: Callable[[], int | None]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except UserError as error:
-        print(f"error: {addresses.named(str(error))}", file=sys.stderr)
+        surroundings.complain(f"error: {addresses.named(str(error))}")
         return 2
     except OSError as error:
-        print(f"error: {UserError(addresses.named(mended(error)))}", file=sys.stderr)
+        surroundings.complain(f"error: {UserError(addresses.named(mended(error)))}")
         return 2
     except KeyboardInterrupt:
-        print("interrupted: run the same command again to continue from here", file=sys.stderr)
+        surroundings.complain("interrupted: run the same command again to continue from here")
         return 130
-    except Exception:
-        missing = _missing_device()
-        if missing is None:
+    except Exception as error:
+        trouble = surroundings.trouble(error)
+        if trouble is None:
             raise
-        print(f"error: {missing}", file=sys.stderr)
+        surroundings.complain(f"error: {UserError(trouble)}")
         return 2
 
 
 def mended(error: OSError) -> str:
     """Return the line that says which file the user has to mend."""
     return f"{error.filename or 'files'}: {error.strerror or error}; mend that and try again"
-
-
-def _missing_device() -> str | None:
-    """Return what is wrong where JAX has been imported and finds no device to compute on; else None."""
-    jax = sys.modules.get("jax")
-    try:
-        if jax is not None:
-            jax.devices()
-    except Exception as error:  # an AssertionError without a word, where no plug-in knows the platform
-        asked = os.environ.get("JAX_PLATFORMS")
-        given = f"JAX_PLATFORMS={asked}" if asked else "JAX"
-        why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0]
-        return f"{given}: no such device here{f' ({why})' if why else ''}; unset JAX_PLATFORMS, or set it to cpu"
-    return None
 
 
 def _parse_and_call(description: str, commands: dict[str, Any], arguments: Sequence[str]) -> int | None:

@@ -111,7 +111,7 @@ def _result(ray: Any, task: Any, function: Callable[..., Any]) -> Any:
 
 def _attempt(function: Callable[..., Any], task: tuple[Any, ...]) -> tuple[Any, str | None]:
     """Return what a task returns, or else the line that says what the user has to mend; another error is raised."""
-    console.enable_compilation_cache()
+    console.prepare()
     try:
         return function(*task), None
     except UserError as error:
@@ -138,7 +138,7 @@ def _warn_of_too_little(ray: Any, launch: Launch) -> None:
 def _require_answer(address: str | None) -> None:
     """Raise a UserError if nothing answers at HOST:PORT, for which Ray would wait many minutes."""
     host, _, port = (address or "").rpartition(":")
-    if not port.isdigit() or "/" in host:  # none, `auto`, `local` or ray://...
+    if not port.isdecimal() or "/" in host:  # none, `auto`, `local` or ray://...
         return
     try:
         socket.create_connection((host.strip("[]"), int(port)), ANSWERS_WITHIN).close()

@@ -51,10 +51,10 @@ def build(name: str, config: Any, *, seed: int = 0) -> nnx.Module:
 
 def _steps(run: pathlib.Path) -> list[pathlib.Path]:
     """Return the step folders of a run, newest first; of a step's folder, itself."""
-    if run.name.isdigit() and run.resolve().parent.name == "checkpoints":
+    if run.name.isdecimal() and run.resolve().parent.name == "checkpoints":
         return [run] if run.is_dir() else []
     folder = run / "checkpoints"
-    found = [p for p in folder.iterdir() if p.name.isdigit()] if folder.is_dir() else []
+    found = [p for p in folder.iterdir() if p.name.isdecimal()] if folder.is_dir() else []
     return sorted(found, key=lambda p: int(p.name), reverse=True)
 
 
@@ -233,7 +233,9 @@ def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
     if base and (step == "best" or step.isdecimal()) and not run.exists():
         return _step(find(pathlib.Path(base), network=network), step)
     if str(run) != "builtin":
-        return files.absolute(run)
+        found = files.absolute(run)
+        files.require_locale(found)
+        return found
     folder = SHIPPED / network
     if not folder.is_dir():
         raise UserError(f"builtin: no {network} network comes with this package; give the --out of a dipn-train run")

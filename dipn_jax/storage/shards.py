@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import pathlib
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -145,6 +146,11 @@ def _reading(path: pathlib.Path) -> Iterator[None]:
         raise DamagedShard(path, "truncated, damaged or not a shard of this project") from None
 
 
+def _opened(path: pathlib.Path) -> pa.OSFile:
+    """Return an open file, by the bytes of its name: Arrow takes a text for UTF-8, whatever the locale says."""
+    return pa.OSFile(os.fsencode(path))
+
+
 def read_meta(path: pathlib.Path) -> dict[str, Any]:
     """Return the metadata of a shard, which agree with its columns; and under `episodes`, how many it has.
 
@@ -153,7 +159,7 @@ def read_meta(path: pathlib.Path) -> dict[str, Any]:
     """
     with _reading(path):
         files.require_regular(path)
-        found = pq.read_metadata(path)
+        found = pq.read_metadata(_opened(path))
         schema = found.schema.to_arrow_schema()
         meta = typed.check(typed.parse((schema.metadata or {}).get(_META_KEY, b"{}")), {"schema_version": int})
         if meta["schema_version"] not in READABLE:
@@ -212,7 +218,7 @@ def read_sizes(path: pathlib.Path) -> np.ndarray:
 def _decoded(path: pathlib.Path, meta: dict[str, Any], names: Iterable[str], *, into: Any = None) -> codec.Columns:
     """Return columns `[B, ...]` of a shard; one that is stored as a difference has to be among them with the other."""
     specs = {name: meta["columns"][name] for name in names}
-    with pq.ParquetFile(path, page_checksum_verification=True) as file:
+    with pq.ParquetFile(_opened(path), page_checksum_verification=True) as file:
         table = file.read(list(specs), use_threads=False)  # those who read many shards have threads of their own
     columns = {}
     for name, spec in specs.items():

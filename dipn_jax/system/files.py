@@ -54,7 +54,8 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
     """Return a path that a user gave with `~` expanded, and absolute; links in it stay.
 
     Raises:
-      UserError: it is empty, there is no such home folder, it is a URL, or a link that leads back to itself.
+      UserError: it is empty, there is no such home folder, it is a URL, its name is not UTF-8, or it is a link that
+        leads back to itself.
     """
     path = not_empty(path)
     if address := addresses.url(path):
@@ -64,11 +65,21 @@ def absolute(path: pathlib.Path | str) -> pathlib.Path:
     except RuntimeError:
         raise UserError(f"{path}: there is no home folder for ~; give the folder's full path") from None
     try:
+        os.fsencode(found).decode("utf-8")
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: a name that is not UTF-8; rename it, or give another path") from None
+    try:
         found.stat()
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise UserError(f"{path}: a link that leads back to itself; delete it, or give another path") from None
     return found
+
+
+def require_locale(path: pathlib.Path) -> None:
+    """Raise a UserError where the locale reads a path's name otherwise than as UTF-8, as libraries of C++ read it."""
+    if str(path).encode("utf-8", "replace") != os.fsencode(path):
+        raise UserError(f"{path}: checkpoints of this name need a locale with UTF-8; set PYTHONUTF8=1, or rename it")
 
 
 def not_empty(path: pathlib.Path | str) -> pathlib.Path:
