@@ -12,9 +12,13 @@ if TYPE_CHECKING:
     from dipn_jax.storage import resume
 
 
+MOST_TABLES = 1_000_000
+"""Most tables or scenes of an evaluation; they are listed before the first begins."""
+
+
 def check(out: pathlib.Path, seed: int, **counts: int) -> None:
     """Raise a UserError for counts that are not positive, a wrong seed, or an `out` that cannot be a folder."""
-    console.require_positive(**counts)
+    console.require_between(1, MOST_TABLES, **counts)
     console.require_seed(seed)
     console.require_out(out)
 

@@ -8,10 +8,9 @@ from typing import Any
 
 from dipn_jax.commands import console
 from dipn_jax.names import EngineName
-from dipn_jax.system import files
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
-from .configs import BaselineConfig, OnlineConfig
+from .configs import LARGEST_BATCH, BaselineConfig, OnlineConfig, check_out
 
 GRASP_ONLINE = OnlineConfig()
 """How `grasp-online` learns unless told otherwise."""
@@ -120,9 +119,9 @@ def baseline(
 
 def _check(out: pathlib.Path, config: OnlineConfig | BaselineConfig) -> None:
     """Raise a UserError for options of learning while acting that make no sense, or an unusable `out`."""
-    console.require_positive(tables=config.tables, updates=config.updates, batch=config.batch)
+    console.require_positive(updates=config.updates)
+    console.require_between(1, LARGEST_BATCH, tables=config.tables, batch=config.batch)
     console.require_positive(learning_rate=config.learning_rate)
     console.require_between(0, 1, weight_decay=config.weight_decay)
     console.require_seed(config.seed)
-    console.require_out(out)
-    files.require_locale(out)
+    check_out(out)

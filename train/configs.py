@@ -19,6 +19,8 @@ ShapeClass = Literal["cuboid", "cylinder", "half_cylinder", "triangular_prism", 
 """A class of shapes, as in `shapes.CLASSES`."""
 LearnerName = Literal["vpg", "rea", "dqn"]
 """A compared method that learns while it acts."""
+LARGEST_BATCH = 65_536
+"""Most examples in a step, and most tables that are acted on side by side."""
 LAST_PORT = 65_535
 """The highest number of a port."""
 _ADDRESS = re.compile(r"(?:\[[0-9A-Fa-f:.%]+\]|[\w.-]+):(?P<port>[0-9]{1,5})", re.ASCII)
@@ -52,11 +54,11 @@ class TrainConfig:
     def __post_init__(self) -> None:
         console.require_positive(
             steps=self.steps,
-            batch=self.batch,
             learning_rate=self.learning_rate,
             eval_every=self.eval_every,
             save_every=self.save_every,
         )
+        console.require_between(1, LARGEST_BATCH, batch=self.batch)
         console.require_between(0, 1, weight_decay=self.weight_decay)
         console.require_seed(self.seed)
         for weight in self.mix:
@@ -131,8 +133,15 @@ def check(config: TrainConfig, compute: Compute, out: pathlib.Path, *, data_sets
             f"--batch {config.batch} --accumulate {compute.accumulate}: want a number that divides the batch"
         )
     check_mix(config, data_sets=data_sets)
+    check_out(out)
+
+
+def check_out(out: pathlib.Path) -> None:
+    """Raise a UserError where no run can be kept in `out`."""
     console.require_out(out)
     files.require_locale(out)
+    if out.name.isdecimal() and out.parent.name == "checkpoints":
+        raise UserError(f"--out {out}: the folder of a step; give its run, {out.parents[1]}, or another folder")
 
 
 def check_mix(config: TrainConfig, *, data_sets: int) -> None:

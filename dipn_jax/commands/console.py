@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import inspect
 import itertools
-import math
 import os
 import pathlib
 import signal
@@ -29,6 +28,8 @@ from dipn_jax.system.interruption import stops
 if TYPE_CHECKING:
     import rich.progress
 
+MOST = 2**31 - 1
+"""Largest value of an option that counts something."""
 LOG_PERIOD = 10.0
 """Seconds between progress lines where there is no terminal."""
 
@@ -143,10 +144,12 @@ def warn(text: str) -> None:
 
 
 def require_positive(**values: float) -> None:
-    """Raise a UserError for the first value that is not a finite number above zero."""
+    """Raise a UserError for the first value that is not a number above zero, or larger than any work that ends."""
     for name, value in values.items():
-        if not (math.isfinite(value) and value > 0):
+        if not value > 0:
             raise UserError(f"{_option(name)} {value}: want a number above 0")
+        if value > MOST:
+            raise UserError(f"{_option(name)} {value:.3g}: want a number above 0 and at most {MOST:,}")
 
 
 def require_between(low: float, high: float, **values: float) -> None:

@@ -19,6 +19,8 @@ LOWEST = -0.05
 """Lowest height that is accepted (metres above the table)."""
 HIGHEST = 1.0
 """Highest height that is accepted (metres above the table); heights given in millimetres exceed it."""
+MOST_SLOTS = 4096
+"""Most object slots that are accepted: each takes memory."""
 
 
 def check_observation(observation: Any) -> None:
@@ -36,12 +38,16 @@ def check_observation(observation: Any) -> None:
       UserError: a map has another shape or kind of number, is not finite, heights are not in metres, colours not in
         [0, 1], or labels not below `slots`.
     """
+    if not isinstance(observation, Observation):
+        raise UserError(f"observation: {type(observation).__name__}, want a dipn_jax.Observation")
     side, slots = WORKSPACE.pixels, observation.slots
     height = _map("height", observation.height, (side, side), np.floating, "metres above the table")
     color = _map("color", observation.color, (side, side, 3), np.floating, "RGB from 0 to 1")
     label = _map("label", observation.label, (side, side), np.signedinteger, f"object slots, {ABSENT} on the table")
-    if not isinstance(slots, (int, np.integer)) or slots < 1:
-        raise UserError(f"observation.slots: {slots!r}; want how many objects there may be, a whole number above 0")
+    if not isinstance(slots, (int, np.integer)) or not 1 <= slots <= MOST_SLOTS:
+        raise UserError(
+            f"observation.slots: {slots!r}; want how many objects there may be, a whole number from 1 to {MOST_SLOTS}"
+        )
     if height.max() > HIGHEST or height.min() < LOWEST:
         raise UserError(
             f"observation.height: {height.min():g} to {height.max():g}; want metres above the table, not millimetres "
@@ -90,6 +96,10 @@ def require_reach(observation: Observation) -> None:
 
 def _map(name: str, values: Any, shape: tuple[int, ...], kind: type, about: str) -> np.ndarray:
     """Return a map as a NumPy array, once its shape and kind are right and it is finite."""
+    if not isinstance(values, (np.ndarray, np.generic, jax.Array)):
+        raise UserError(f"observation.{name}: {type(values).__name__}, want an array of NumPy or JAX: {about}")
+    if holes := int(np.ma.count_masked(values)) if isinstance(values, np.ma.MaskedArray) else 0:
+        raise UserError(f"observation.{name}: {holes} values are masked; fill holes before, say with .filled(0)")
     array = np.asarray(values)
     if array.shape != shape:
         raise UserError(
@@ -98,6 +108,11 @@ def _map(name: str, values: Any, shape: tuple[int, ...], kind: type, about: str)
     if not np.issubdtype(array.dtype, kind) and not (kind is np.floating and array.dtype.name == "bfloat16"):
         wanted = "floating-point numbers" if kind is np.floating else "whole numbers with a sign"
         raise UserError(f"observation.{name}: holds {array.dtype}, want {wanted}: {about}")
+    if not array.dtype.isnative:  # JAX would take its bytes as they stand
+        raise UserError(
+            f"observation.{name}: holds {array.dtype.str}, the byte order of other machines; want this one's: "
+            f".astype(np.{array.dtype.name})"
+        )
     if not np.isfinite(array).all():
         holes = int((~np.isfinite(array)).sum())
         raise UserError(f"observation.{name}: {holes} values are NaN or infinite; fill holes before, say with 0")

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
-from dipn_jax.system import temporary, typed
+from dipn_jax.system import files, temporary, typed
 
 try:
     import fcntl
@@ -56,6 +56,8 @@ def _locked(path: pathlib.Path) -> tuple[int, pathlib.Path]:
     while True:
         if fcntl is None:
             return _exclusive(path.with_name("owner.exclusive.json"))
+        if path.exists():
+            files.require_regular(path)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -11,6 +11,7 @@ import importlib.metadata
 import json
 import os
 import pathlib
+import re
 import shutil
 import stat
 import time
@@ -22,6 +23,7 @@ from dipn_jax.system import addresses, temporary, typed
 
 EMPTY = "'': an empty path, as of a variable that is not set; give a path, or . for this folder"
 """What is said of an empty path."""
+_BUILTIN = re.compile(r"builtin(@(best|\d+))?")
 
 
 def package_versions() -> dict[str, str]:
@@ -104,7 +106,7 @@ def with_absolute_paths(value: Any, *, urls: bool = False) -> Any:
       UserError: as `absolute`.
     """
     if isinstance(value, pathlib.Path):
-        return value if str(value) == "builtin" or (urls and addresses.url(value)) else absolute(value)
+        return value if _BUILTIN.fullmatch(str(value)) or (urls and addresses.url(value)) else absolute(value)
     if isinstance(value, tuple):
         return tuple(with_absolute_paths(each, urls=urls) for each in value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -51,20 +51,29 @@ class Maybe:
 
 
 def parse(text: str | bytes) -> Any:
-    """Return what a JSON text holds: UTF-8 with or without a byte-order mark, and no number that is not finite.
+    """Return what a JSON text holds: UTF-8 with or without a byte-order mark, no key twice, every number finite.
 
     Raises:
       Misfit: it is no JSON.
     """
     try:
         text = text.decode("utf-8-sig") if isinstance(text, bytes) else text
-        return json.loads(text, parse_constant=_finite, parse_float=_finite)
+        return json.loads(text, parse_constant=_finite, parse_float=_finite, object_pairs_hook=_without_repeats)
     except UnicodeDecodeError:
         raise Misfit("not JSON (not UTF-8)") from None
     except RecursionError:
         raise Misfit("not JSON that can be used (nested too deeply)") from None
     except ValueError as error:
         raise Misfit(f"not JSON ({str(error).splitlines()[0]})") from None
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object; of a key that is there twice, Python would keep the last value without a word."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"{brief(next(key for key in keys if keys.count(key) > 1))} is there twice in one object")
+    return found
 
 
 def _finite(text: str) -> float:

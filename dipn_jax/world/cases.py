@@ -28,6 +28,8 @@ _OBJECT = {
     "height_m?": typed.Maybe(float),
 }
 """Form of an object, beside its shape."""
+_KNOWN = ("shape", *(name.removesuffix("?") for name in _OBJECT))
+"""Entries of an object."""
 _CASES = {"cases": [{"name?": object, "objects": [dict]}]}
 """Form of a case file."""
 _DATA = pathlib.Path(__file__).parents[1] / "data"
@@ -109,6 +111,8 @@ def _case(objects: list[dict[str, Any]], n: int, where: str) -> tuple[Scene, Flo
             )
         try:
             typed.check(entry, _OBJECT)
+            if unknown := [key for key in entry if key not in _KNOWN]:
+                raise typed.Misfit(f"unknown entry {typed.brief(unknown[0])}, none of {', '.join(_KNOWN)}")
             size[i] = _numbers(entry["size_mm"]) / 1000
             position = _numbers(entry["position_m"])
             quat = _numbers(entry["quaternion_wxyz"])

@@ -54,6 +54,8 @@ def _require_in_catalogue(items: tuple[str, ...]) -> None:
     from dipn_jax.world import shapes
 
     names = [item.name for item in shapes.CATALOGUE]
+    if len(set(items)) < len(items):
+        raise UserError(f"--items {' '.join(items)}: want none twice")
     unknown = [name for name in items if name not in names]
     if unknown:
         raise UserError(f"--items {' '.join(unknown)}: not in the catalogue; choose from {' '.join(sorted(names))}")

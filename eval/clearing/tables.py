@@ -11,6 +11,8 @@ from dipn_jax.errors import UserError
 from dipn_jax.system import files
 from dipn_jax.world.ranges import DEFAULT_RANGES, Ranges
 
+from .. import options
+
 if TYPE_CHECKING:
     from dipn_jax.engine import Engine
 
@@ -38,7 +40,9 @@ class Tables:
     """The ranges that random objects are drawn from."""
 
     def __post_init__(self) -> None:
-        console.require_positive(instances=self.instances)
+        console.require_between(1, options.MOST_TABLES, instances=self.instances)
+        if len(set(self.names)) < len(self.names):
+            raise UserError(f"--names {' '.join(self.names)}: want none twice; give --instances for repeats")
         if self.names and self.cases == "random":
             raise UserError("--names: random tables have none; give --cases hard or a case file")
         if self.as_placed and (self.cases == "random" or self.instances > 1):

@@ -43,6 +43,11 @@ BAD = {
     "label: 3 to 3; want -1 on the table and less than slots=3": {"label": np.full(SIDE, 3, np.int32)},
     "label: -2 to -2": {"label": np.full(SIDE, -2, np.int32)},
     "slots: 0; want": {"slots": 0},
+    "slots: 1000000000; want": {"slots": 10**9},
+    "height: holds >f4, the byte order of other machines": {"height": _with(0.05).astype(">f4")},
+    "height: 1 values are masked": {"height": np.ma.masked_equal(_with(0.05), np.float32(0.05))},
+    "height: list, want an array": {"height": _with(0.05).tolist()},
+    "label: memoryview, want an array": {"label": memoryview(np.zeros(SIDE, np.int32))},
 }
 
 
@@ -59,6 +64,11 @@ def test_what_no_network_can_judge_is_refused_in_one_line(says: str) -> None:
     with pytest.raises(dipn_jax.UserError) as refused:
         dipn_jax.check_observation(bad)
     assert str(refused.value).startswith(f"observation.{says}") and "\n" not in str(refused.value)
+
+
+def test_what_is_no_observation_is_refused() -> None:
+    with pytest.raises(dipn_jax.UserError, match="observation: ndarray, want a dipn_jax"):
+        dipn_jax.check_observation(np.zeros(SIDE, np.float32))
 
 
 def test_a_policy_refuses_it_before_it_decides() -> None:

@@ -106,3 +106,10 @@ def test_a_damaged_owner_file_names_nobody(text: str, tmp_path: pathlib.Path) ->
     (tmp_path / "owner.json").write_text(text)
     assert not owner._dead(tmp_path / "owner.json")
     assert "\n" not in str(owner._taken(tmp_path / "owner.json"))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with a name here")
+def test_an_owner_file_that_is_none_is_named(tmp_path: pathlib.Path) -> None:
+    os.mkfifo(tmp_path / "owner.json")
+    with pytest.raises(OSError, match=r"not a regular file.*owner\.json"), owner.owned(tmp_path):
+        pass

@@ -65,6 +65,7 @@ def test_what_does_not_fit_is_said_in_one_line(key: str, value: Any, said: str) 
         b"9" * 5000,
         '{"a":\n\n1 2}',
         b"\0",
+        '{"a": 1, "b": {"c": 1, "c": 1}}',
     ],
 )
 def test_what_is_no_json_is_said_in_one_line(text: str | bytes) -> None:

@@ -73,6 +73,7 @@ def _file(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
         ({"size_mm": ["50", "50", "50"]}, r"size_mm\[0\] is 50, want a finite number"),
         ({"shape": ["cuboid"]}, "unknown shape 'a list of 1'"),
         ({"color_rgb": [-9999, 0, 0]}, "color_rgb"),
+        ({"hieght_m": 0.1}, "unknown entry hieght_m, none of shape, size_mm"),
     ],
 )
 def test_a_wrong_case_file_is_named(tmp_path: pathlib.Path, changes: dict[str, Any], says: str) -> None:
@@ -102,6 +103,8 @@ def test_a_config_that_contradicts_itself_is_named() -> None:
         scenes.SceneConfig(slots=2, counts=(0.5, 0.3, 0.2))
     with pytest.raises(UserError, match="not in the catalogue"):
         scenes.Ranges(items=("banana",))
+    with pytest.raises(UserError, match="--items cube cube: want none twice"):
+        scenes.Ranges(items=("cube", "cube"))
 
 
 def test_ranges_out_of_bounds_are_named_as_options() -> None:
