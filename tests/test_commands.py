@@ -255,6 +255,13 @@ def test_a_device_that_is_not_there_is_one_line(platform: str, tmp_path: pathlib
         _one_line((process.returncode, error), f"JAX_PLATFORMS={platform}: no such device here")
 
 
+def test_too_little_memory_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    def large() -> None:
+        raise MemoryError
+
+    _one_line((console.exit_code(large), capfd.readouterr().err), "not enough memory")
+
+
 def test_another_error_is_none_of_the_users() -> None:
     def broken() -> None:
         raise AssertionError("ours")

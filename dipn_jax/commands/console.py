@@ -232,6 +232,9 @@ def exit_code(work: Callable[[], int | None]) -> int:
     except OSError as error:
         surroundings.complain(f"error: {UserError(addresses.named(mended(error)))}")
         return 2
+    except MemoryError:
+        surroundings.complain("error: not enough memory; make room, or ask for less at a time")
+        return 2
     except KeyboardInterrupt:
         surroundings.complain("interrupted: run the same command again to continue from here")
         return 130

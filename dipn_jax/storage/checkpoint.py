@@ -155,11 +155,16 @@ def export(run: pathlib.Path, out: pathlib.Path, *, network: str) -> None:
 
 
 def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
-    """Return the metadata of a step folder, or None if anything in it is missing or changed."""
+    """Return the metadata of a step folder, or None if anything in it is missing or changed.
+
+    What this user may not read is not taken for damage: the step before it would be used.
+    """
     try:
         meta: dict[str, Any] = typed.check(typed.parse(files.read_bytes(folder / "meta.json")), stored_step.FORM)
         stored = {typed.inside(folder, name): digest for name, digest in meta["sha256"].items()}
         good = all(files.file_sha256(path) == digest for path, digest in stored.items())
+    except PermissionError:
+        raise
     except (OSError, typed.Misfit):
         return None
     return meta if good and meta["format_version"] == FORMAT_VERSION and meta["network"] in NETWORKS else None

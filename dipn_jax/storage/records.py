@@ -71,8 +71,21 @@ def examined(folder: pathlib.Path) -> tuple[Problems, str | None]:
     with concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool:
         looks = list(zip(paths, pool.map(_look, paths, listed.values()), strict=True))
     looks += [(path, _look_through(path)) for path in manifest.unlisted(folder, listed)]
+    looks = _of_one_kind(looks)
     mixed = accounting.mixed(accounting.makers([meta for _, (_, meta) in looks if meta is not None]))
     return [(path, what) for path, (what, _) in looks if what], mixed and f"{folder}: {mixed}"
+
+
+def _of_one_kind(looks: list[tuple[pathlib.Path, Look]]) -> list[tuple[pathlib.Path, Look]]:
+    """Return what was found of shards; those of another kind than most are wrong, as when they were copied there."""
+    kinds = [meta["kind"] for _, (_, meta) in looks if meta is not None]
+    most = max(kinds, key=kinds.count, default=None)
+    return [
+        (path, (f"holds {meta['kind']} episodes among {most} episodes", None))
+        if meta is not None and meta["kind"] != most
+        else (path, (what, meta))
+        for path, (what, meta) in looks
+    ]
 
 
 def repair(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -88,8 +101,9 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     except UserError:
         known = {}
     removed = []
-    for path in shards.shard_files(folder):
-        if not _good(path, known.get(path.name)):
+    looks = [(path, _judged(path, known.get(path.name))) for path in shards.shard_files(folder)]
+    for path, (what, _) in _of_one_kind(looks):
+        if what:
             files.move(path, path.with_suffix(".parquet.damaged"))
             removed.append(path)
     (folder / MANIFEST).unlink(missing_ok=True)
@@ -97,11 +111,11 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     return removed
 
 
-def _good(path: pathlib.Path, entry: dict[str, Any] | None) -> bool:
-    """Return whether a shard can be read to its end, and is the one that the manifest lists, if it lists one."""
+def _judged(path: pathlib.Path, entry: dict[str, Any] | None) -> Look:
+    """Return what is wrong with a shard: it cannot be read to its end, or is not the one that the manifest lists."""
     if entry is not None and (not path.is_file() or files.file_sha256(path) != entry["sha256"]):
-        return False
-    return not _look_through(path)[0]
+        return "not the one that the manifest lists", None
+    return _look_through(path)
 
 
 def summary(folder: pathlib.Path) -> dict[str, Any]:

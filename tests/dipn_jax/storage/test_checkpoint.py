@@ -1,3 +1,4 @@
+import errno
 import json
 import pathlib
 import resource
@@ -262,3 +263,21 @@ def test_a_missing_device_is_not_taken_for_a_damaged_file(
     monkeypatch.setattr(jax, "devices", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         stored_step.arrays(tmp_path / "checkpoints" / "00000001" / "model")
+
+
+def test_a_step_that_may_not_be_read_is_not_taken_for_a_damaged_one(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The step before it would be used, and measured."""
+    _save(tmp_path, 10)
+    _save(tmp_path, 20)
+    read = files.read_bytes
+
+    def refuse(path: pathlib.Path) -> bytes:
+        if "00000020" in path.parts:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return read(path)
+
+    monkeypatch.setattr(files, "read_bytes", refuse)
+    with pytest.raises(PermissionError, match=r"00000020/meta\.json"):
+        checkpoint.load_network(tmp_path, network="grasp")

@@ -212,3 +212,13 @@ def test_without_locks_a_shard_that_comes_while_the_manifest_is_written_is_liste
     monkeypatch.setattr(files, "write_json", slow)
     assert set(update_manifest(copy)["shards"]) == {"shard-00000.parquet", late.name}
     assert records.verify(copy) == []
+
+
+def test_a_shard_of_another_kind_is_named_and_set_aside(data: dict[str, pathlib.Path], copy: pathlib.Path) -> None:
+    stranger = shards.shard_path(copy, 2)
+    shutil.copy(shards.shard_path(data["images"], 0), stranger)
+    assert records.verify(copy) == [(stranger, "holds images episodes among push episodes")]
+    with pytest.raises(UserError, match=r"shard-00002\.parquet holds images episodes among push"):
+        records.load(copy, kind="push")
+    assert records.repair(copy) == [stranger]
+    assert not records.verify(copy) and records.summary(copy)["episodes"] == 24
