@@ -23,13 +23,14 @@ import tyro
 from dipn_jax.commands import option_paths, surroundings
 from dipn_jax.errors import UserError
 from dipn_jax.system import addresses, files
-from dipn_jax.system.interruption import stops
+from dipn_jax.system.interruption import Stopping
 
 if TYPE_CHECKING:
     import rich.progress
 
 MOST = 2**31 - 1
 """Largest value of an option that counts something."""
+INTERRUPTED = "interrupted: run the same command again to continue from here"
 LOG_PERIOD = 10.0
 """Seconds between progress lines where there is no terminal."""
 
@@ -215,14 +216,13 @@ def exit_code(work: Callable[[], int | None]) -> int:
       What `work` returns, or 0 if that is None; 2 after one line on standard error for a mistake of the user's; 130
       when interrupted (what was written before stays valid, and the same command continues).
     """
-    if threading.current_thread() is threading.main_thread():
-        for number in stops():
-            signal.signal(number, signal.default_int_handler)
+    stopping = Stopping()
     try:
-        try:
-            return work() or 0
-        finally:
-            sys.stdout.flush()
+        with stopping:
+            try:
+                return work() or 0
+            finally:
+                sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output, such as `head`, has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
@@ -236,9 +236,12 @@ def exit_code(work: Callable[[], int | None]) -> int:
         surroundings.complain("error: not enough memory; make room, or ask for less at a time")
         return 2
     except KeyboardInterrupt:
-        surroundings.complain("interrupted: run the same command again to continue from here")
+        surroundings.complain(INTERRUPTED)
         return 130
     except Exception as error:
+        if stopping.number is not None:  # some library's own error for what interrupted it
+            surroundings.complain(INTERRUPTED)
+            return 130
         trouble = surroundings.trouble(error)
         if trouble is None:
             raise

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 from typing import Any
 
@@ -13,6 +15,48 @@ STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1")
 def stops() -> list[signal.Signals]:
     """Return the signals of STOPS that are heeded: all, but none that is ignored because `nohup` asked for it."""
     return [number for number in STOPS if signal.getsignal(number) != signal.SIG_IGN]
+
+
+AGAIN_AFTER = 0.05
+"""Seconds after which a signal is sent again whose KeyboardInterrupt was lost."""
+
+
+class Stopping:
+    """A context in which SIGINT and the signals of STOPS raise KeyboardInterrupt.
+
+    Where it is raised within a callback, as JAX has one at each garbage collection, Python prints it and goes on: then
+    the signal is sent again instead. Handlers stay in place at the end.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        """The signal that came, if one did."""
+        self._hook = sys.unraisablehook
+
+    def __enter__(self) -> Stopping:
+        if threading.current_thread() is threading.main_thread():
+            usual = signal.getsignal(signal.SIGINT) == signal.default_int_handler
+            for number in (*([signal.SIGINT] if usual else []), *stops()):
+                signal.signal(number, self._stop)
+            self._hook, sys.unraisablehook = sys.unraisablehook, self._lost
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if sys.unraisablehook == self._lost:
+            sys.unraisablehook = self._hook
+
+    def _stop(self, number: int, _: object) -> None:
+        self.number = number
+        raise KeyboardInterrupt
+
+    def _lost(self, lost: Any) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            number = self.number or signal.SIGINT
+            again = threading.Timer(AGAIN_AFTER, lambda: os.kill(os.getpid(), number))
+            again.daemon = True
+            again.start()
+        else:
+            self._hook(lost)
 
 
 class Interruption:

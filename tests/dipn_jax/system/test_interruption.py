@@ -1,7 +1,9 @@
 """Every signal by which a job manager or a terminal ends work is an interruption."""
 
+import gc
 import os
 import signal
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -47,3 +49,32 @@ def test_a_hang_up_that_nohup_ignores_stays_ignored() -> None:
         os.kill(os.getpid(), signal.SIGHUP)
 
     assert console.exit_code(work) == 0
+
+
+@pytest.mark.parametrize("number", ALL)
+def test_a_signal_within_a_callback_is_not_lost(number: signal.Signals, capfd: pytest.CaptureFixture[str]) -> None:
+    """Python prints what a callback raises, and goes on."""
+
+    def callback(phase: str, _: object) -> None:
+        if phase == "start" and callback in gc.callbacks:
+            gc.callbacks.remove(callback)
+            os.kill(os.getpid(), number)
+
+    def work() -> None:
+        gc.callbacks.append(callback)
+        gc.collect()
+        time.sleep(5)
+
+    assert console.exit_code(work) == 130
+    assert capfd.readouterr().err == f"{console.INTERRUPTED}\n"
+
+
+def test_what_a_library_makes_of_an_interruption_is_one(capfd: pytest.CaptureFixture[str]) -> None:
+    def work() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise RecursionError("in an import") from None
+
+    assert console.exit_code(work) == 130
+    assert capfd.readouterr().err == f"{console.INTERRUPTED}\n"
