@@ -20,6 +20,7 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import VIEW_PIXELS, GraspConfig
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import candidates, methods, planner, predictors, scorers
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.sight import imagine, masks, render
 from dipn_jax.storage import checkpoint, resume
 from dipn_jax.structs import Decision, Observation, Push
@@ -184,7 +185,7 @@ def in_lockstep(setting: Setting) -> Iterator[tuple[str, float]]:
     engine, path = make_engine("native"), cases.hard_cases_path()
     slots, repeats = int(cases.load_cases(path)[1].shape.shape[1]), setting.pick(1, 3)
     networks = methods.Networks(BUILTIN, BUILTIN)
-    (decide,) = on_tables.load("dipn+gn", networks, engine, [methods.PolicyConfig()])
+    (decide,) = on_tables.load("dipn+gn", networks, engine, [PolicyConfig()])
 
     def tables() -> list[instances.Instance]:
         return instances.hard_instances(engine, path, None, slots=slots, repeats=repeats, seed=setting.seed)

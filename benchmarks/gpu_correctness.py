@@ -18,6 +18,7 @@ from dipn_jax import structs
 from dipn_jax.engine import Engine
 from dipn_jax.planning import methods
 from dipn_jax.planning.planner import NONE_MISSED
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.structs import Decision, Fault
 from dipn_jax.world import cases, clutter, primitives
 
@@ -31,7 +32,7 @@ Found = Iterator[tuple[str, float]]
 @functools.cache
 def policy(size: Size) -> on_tables.TablePolicy:
     """Return the shipped networks as a policy of many tables, which considers `size.candidates` pushes on each."""
-    config = methods.PolicyConfig(candidates=size.candidates, grasp_above=1.0)
+    config = PolicyConfig(candidates=size.candidates, grasp_above=1.0)
     networks = methods.Networks(BUILTIN, BUILTIN)
     (decide,) = on_tables.load("dipn+gn", networks, engine("native", size), [config])
     return decide

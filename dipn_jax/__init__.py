@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from dipn_jax.errors import UserError
     from dipn_jax.physics import make_engine
     from dipn_jax.planning.memory import MissedGrasps
-    from dipn_jax.planning.methods import PolicyConfig, load_policy
+    from dipn_jax.planning.methods import load_policy
     from dipn_jax.planning.planner import decide
+    from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.sight.imagine import imagine
     from dipn_jax.sight.observed import check_observation
     from dipn_jax.sight.render import render
@@ -61,8 +62,9 @@ _MODULES = {
     "structs": ("Decision", "Grasp", "Observation", "Push", "Scene"),
     "physics": ("make_engine",),
     "planning.memory": ("MissedGrasps",),
-    "planning.methods": ("PolicyConfig", "load_policy"),
+    "planning.methods": ("load_policy",),
     "planning.planner": ("decide",),
+    "planning.policy_config": ("PolicyConfig",),
     "sight.imagine": ("imagine",),
     "sight.observed": ("check_observation",),
     "sight.render": ("render",),

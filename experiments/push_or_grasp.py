@@ -29,7 +29,8 @@ from dipn_jax.engine import Engine
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import outlook, scorers
 from dipn_jax.planning.memory import MissedGrasps
-from dipn_jax.planning.methods import Networks, PolicyConfig
+from dipn_jax.planning.methods import Networks
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.sight import render
 from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import Array, Decision, Observation, Scene

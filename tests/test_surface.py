@@ -20,7 +20,7 @@ from dipn_jax.names import MethodName
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.planning import methods, predictors
-from dipn_jax.planning.methods import PolicyConfig
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.storage import checkpoint
 from dipn_jax.world.cases import hard_cases_path
 

@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Float, Int, Key
 
 from dipn_jax.errors import UserError
-from dipn_jax.names import ALL_AIDS, Aid, MethodName
+from dipn_jax.names import Aid, MethodName
 from dipn_jax.networks import vpg
 from dipn_jax.planning import acts, outlook, planner, predictors, scorers
 from dipn_jax.planning.acts import Act
 from dipn_jax.planning.planner import Predictor, Rule, Scorer, ScoreSummary
+from dipn_jax.planning.policy_config import DEFAULT_CONFIG, PolicyConfig
 from dipn_jax.sight import observed
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Array, Decision, Observation
@@ -32,8 +33,6 @@ ROLES: dict[NetworkRole, tuple[str, str]] = {
     "value": ("vpg", "baseline"),
 }
 """What a network does in a method -> its name in checkpoints, and the dipn-train command that trains it."""
-LONGEST_PUSH = 0.12
-"""Length in metres of the longest push: simulated and learnt pushes of 10 cm, and a little beyond."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,34 +69,6 @@ class Policy:
     def with_config(self, config: PolicyConfig) -> Policy:
         """Return a policy of the same networks with another rule and other distances; as many candidates as before."""
         return dataclasses.replace(self, rule=config.rule(), distances=config.spread())
-
-
-@dataclasses.dataclass(frozen=True)
-class PolicyConfig:
-    """How a method decides, apart from its networks.
-
-    Example:
-      config = dipn_jax.PolicyConfig(gamma=0.8, aids=())       # no aids: bare
-      policy = dipn_jax.load_policy("dipn+gn", config=config)
-    """
-
-    candidates: int = 32  # pushes considered at a time
-    distances: tuple[float, ...] = (0.10,)  # metres a push goes; of several, candidates take them in turn
-    gamma: float = 0.9
-    grasp_above: float = 0.7
-    released: bool = False  # with the clauses of DIPN's released code
-    aids: tuple[Aid, ...] = ALL_AIDS  # what no paper has; `memory` is for the caller, who gives the misses
-
-    def rule(self) -> Rule:
-        """Return the rule that the planner compares by."""
-        rule = planner.RELEASED if self.released else Rule()
-        small, margin = "still" not in self.aids, planner.TOP_MARGIN if "top" in self.aids else 0.0
-        result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above, draw_all=small, top_margin=margin)
-        return result
-
-    def spread(self) -> Float[np.ndarray, " P"]:
-        """Return the distance of each candidate in metres."""
-        return np.resize(np.asarray(self.distances, np.float32), self.candidates)
 
 
 Runs = dict[str, pathlib.Path]
@@ -158,7 +129,7 @@ def load_policy(
     push_net: pathlib.Path | str | None = "builtin",
     grasp_net: pathlib.Path | str | None = "builtin",
     value_net: pathlib.Path | str | None = None,
-    config: PolicyConfig = PolicyConfig(),
+    config: PolicyConfig = DEFAULT_CONFIG,
 ) -> Policy:
     """Load the policy of a method, with the networks that come with the package or with your own.
 
@@ -205,7 +176,7 @@ def _of_shipped(
     return build(dict(runs), PolicyConfig(released=released, aids=aids))
 
 
-def grasping_policy(scorer: Scorer, config: PolicyConfig = PolicyConfig()) -> Policy:
+def grasping_policy(scorer: Scorer, config: PolicyConfig = DEFAULT_CONFIG) -> Policy:
     """Return the policy that grasps where `scorer` is highest, and never pushes."""
     act = acts.imagining(predictors.static_predictor, scorer, None)
     return Policy(act, config.rule().replace(grasp_above=-1.0), np.array([0.1], np.float32))

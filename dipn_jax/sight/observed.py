@@ -17,6 +17,8 @@ from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 F = TypeVar("F", bound=Callable[..., Any])
 LOWEST = -0.05
 """Lowest height that is accepted (metres above the table)."""
+BARE = 0.1
+"""Height in metres that some pixel must not exceed: a heap never covers the whole table."""
 HIGHEST = 1.0
 """Highest height that is accepted (metres above the table); heights given in millimetres exceed it."""
 MOST_SLOTS = 4096
@@ -52,6 +54,11 @@ def check_observation(observation: Any) -> None:
         raise UserError(
             f"observation.height: {height.min():g} to {height.max():g}; want metres above the table, not millimetres "
             "and not the distance from the camera"
+        )
+    if height.min() > BARE:
+        raise UserError(
+            f"observation.height: at least {height.min():g} everywhere, so that no table is seen; want metres above "
+            "the table, not the distance from the camera"
         )
     if color.max() > 1 or color.min() < 0:
         raise UserError(f"observation.color: {color.min():g} to {color.max():g}; want 0 to 1: divide bytes by 255")

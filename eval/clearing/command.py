@@ -81,7 +81,8 @@ def clear(
     asked = dict(locals())
     given = evaluation.settings(asked)
     from dipn_jax.physics import grouped, make_engine
-    from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.planning.methods import Networks
+    from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.storage import resume
 
     from .. import spread

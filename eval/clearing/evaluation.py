@@ -17,7 +17,7 @@ from .tables import SHIPPED, Tables
 
 if TYPE_CHECKING:
     from dipn_jax.engine import Engine
-    from dipn_jax.planning.methods import PolicyConfig
+    from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.storage import resume
 
     from .on_tables import TablePolicy
@@ -42,7 +42,7 @@ def settings(given: dict[str, Any]) -> dict[str, Any]:
 
 def check(out: pathlib.Path, seed: int, config: PolicyConfig, tables: Tables) -> None:
     """Raise a UserError for options that make no sense, and a case file that cannot be used."""
-    from dipn_jax.planning.methods import LONGEST_PUSH
+    from dipn_jax.planning.policy_config import LONGEST_PUSH
 
     options.check(out, seed, candidates=config.candidates)
     console.require_between(1, MAX_CANDIDATES, candidates=config.candidates)

@@ -12,8 +12,9 @@ from dipn_jax import batching
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.planning import methods
-from dipn_jax.planning.methods import Act, Networks, Policy, PolicyConfig
+from dipn_jax.planning.methods import Act, Networks, Policy
 from dipn_jax.planning.planner import Rule
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.structs import Array, Decision, Observation, Scene
 
 from . import rollouts

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from dipn_jax.engine import Engine
-    from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.planning.methods import Networks
+    from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.storage import resume
 
 
@@ -76,7 +77,8 @@ def sweep(
     asked = dict(locals())
     given = evaluation.settings(asked) | {"method": "dipn+gn", "label": ""}
     from dipn_jax.physics import grouped, make_engine
-    from dipn_jax.planning.methods import Networks, PolicyConfig
+    from dipn_jax.planning.methods import Networks
+    from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.storage import owner, resume
 
     from .. import metrics, spread

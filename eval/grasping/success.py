@@ -14,6 +14,7 @@ from dipn_jax.engine import Engine
 from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.planning import candidates, methods
 from dipn_jax.planning.planner import Scorer
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.seeds import Purpose
 from dipn_jax.sight import render
 from dipn_jax.sight.fingers import label_image
@@ -68,7 +69,7 @@ def tried(
     found = {"random_table": rows} | _random_foreground(
         scorer, engine, tables, _random_keys(seed, scenes)[rows], camera
     )
-    policy = methods.grasping_policy(scorer, methods.PolicyConfig(aids=aids))
+    policy = methods.grasping_policy(scorer, PolicyConfig(aids=aids))
     decide = on_tables.in_lockstep(policy, camera=camera)
     tables = lockstep.clear(tables, engine, decide, partial, seed=seed, remember="memory" in aids)
     found["table"] = rows.repeat([len(table.did) for table in tables])

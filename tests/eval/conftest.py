@@ -11,7 +11,8 @@ from flax import nnx
 
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.planning.methods import Networks, PolicyConfig
+from dipn_jax.planning.methods import Networks
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.storage import checkpoint
 from dipn_jax.storage.resume import Partial
 from dipn_jax.world import cases

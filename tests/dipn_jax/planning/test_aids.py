@@ -13,7 +13,7 @@ from dipn_jax.names import ALL_AIDS, Aid
 from dipn_jax.networks import grasp
 from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.planning import methods, planner, predictors, scorers
-from dipn_jax.planning.methods import PolicyConfig
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.sight import fingers
 from dipn_jax.storage import checkpoint
 from dipn_jax.structs import Observation, Push

@@ -36,6 +36,7 @@ BAD = {
     "height: 1 values are NaN or infinite": {"height": _with(np.nan)},
     "height: 0 to 45; want metres above the table, not millimetres": {"height": _with(45.0)},
     "height: -0.7 to 0; want metres": {"height": _with(-0.7)},
+    "height: at least 0.65 everywhere, so that no table is seen": {"height": 0.7 - _with(0.05)},
     "color: holds uint8": {"color": np.zeros((*SIDE, 3), np.uint8)},
     "color: 255 to 255; want 0 to 1": {"color": np.full((*SIDE, 3), 255, np.float32)},
     "color: has shape (224, 224, 4)": {"color": np.ones((*SIDE, 4), np.float32)},

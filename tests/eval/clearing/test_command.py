@@ -19,7 +19,8 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.planning import planner, predictors
-from dipn_jax.planning.methods import Networks, PolicyConfig
+from dipn_jax.planning.methods import Networks
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.storage import checkpoint
 from dipn_jax.world import cases, scenes
 
