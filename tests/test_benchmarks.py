@@ -43,6 +43,11 @@ def test_the_page_of_large_data_sets_shows_the_figures_in_docs() -> None:
         assert table in text
     hours = kept["machine"][0]["cores"] * scaling.MILLION / kept["figures"]["rates.native/push/7"] / 3600
     assert f"A million pushes of seven objects cost {hours:.1f} core-hours" in text
+    fast = json.loads((DOCS / "benchmarks.json").read_text())["figures"]
+    written, read = fast["datagen.encoding"], fast["datagen.encoding/read"]
+    at = " ".join(text.split())
+    assert f"write {round(written, -4):,.0f} pushes" in at and f"reads {round(read, -4):,.0f} a second" in at
+    assert f"a million in {1e6 / read:.0f} s" in at
     assert f"takes its driver {kept['figures']['jobs.overhead/launch_milliseconds']:.2g} ms" in text
 
 
