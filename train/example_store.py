@@ -14,10 +14,13 @@ import numpy as np
 
 from dipn_jax import batching, structs
 from dipn_jax.commands import console
+from dipn_jax.errors import UserError
 from dipn_jax.system import files
 
 _LARGEST = 1e6
 """Bytes that an example takes at most: tenfold those of a push of thirty objects."""
+SPARE = 100e6
+"""Bytes that are left free on the disk where examples are kept."""
 _WHOLE = "whole.json"
 """File that says what the examples are of, and that none was cut off while it was written."""
 
@@ -85,6 +88,22 @@ class Kept:
             self._store.close()
 
 
+class Filled:
+    """Examples that are made in parts, in arrays that are made once: no more memory than they need."""
+
+    def __init__(self, count: int) -> None:
+        self.whole: Any = None
+        self._count = count
+
+    def put(self, begin: int, part: Any) -> None:
+        """Put examples, a struct with a leading `[B]`, at the numbers from `begin` on."""
+        part = jax.tree.map(np.asarray, part)
+        if self.whole is None:
+            self.whole = jax.tree.map(lambda leaf: np.empty((self._count, *leaf.shape[1:]), leaf.dtype), part)
+        for array, leaf in zip(jax.tree.leaves(self.whole), jax.tree.leaves(part), strict=True):
+            array[begin : begin + len(leaf)] = leaf
+
+
 class ExampleStore:
     """Examples in files that are mapped into memory; the operating system caches them.
 
@@ -114,11 +133,21 @@ class ExampleStore:
         *leaves, made = arrays
         missing = np.unique(index[~made[index]])
         if len(missing):
+            self._require_room(sum(array[:1].nbytes for array in leaves) * len(missing))
             rows = _filled(missing)
             for array, leaf in zip(leaves, jax.tree.leaves(self._make(rows)), strict=True):
                 array[missing] = np.asarray(leaf)[: len(missing)]
             made[missing] = True
         return jax.tree.unflatten(self._structure, [np.asarray(array[index]) for array in leaves])
+
+    def _require_room(self, size: int) -> None:
+        """Raise a UserError where the disk has no room for `size` bytes; a mapped file would end the process there."""
+        free = shutil.disk_usage(self._folder).free
+        if free < size + SPARE:
+            raise UserError(
+                f"{self._folder}: {free / 1e6:.0f} MB are free, too little for more examples; make room and give the "
+                "same command again, or give a larger --memory"
+            )
 
     def _open(self, some: Any) -> None:
         """Map the files, which are made if those of another process cannot be taken up; `some` examples show shapes."""

@@ -20,7 +20,7 @@ from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, Se
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
-from .example_store import IN_MEMORY, Kept, Room
+from .example_store import IN_MEMORY, Filled, Kept, Room
 from .split import Folders, first, load_sides, within
 
 PRETRAIN_VIEW = 192
@@ -239,12 +239,14 @@ class GraspTask:
         return taken
 
     def _prepare_all(self, episodes: GraspEpisode) -> Window:
-        made, count, some = [], len(episodes.fault), 8 * batching.BATCH
+        count, some = len(episodes.fault), 8 * batching.BATCH
+        made = Filled(count)
         with console.Progress("render windows", count, unit="grasps") as progress:
             for begin in range(0, count, some):
-                made.append(self.prepare(structs.take(episodes, slice(begin, begin + some))))
-                progress.advance(len(made[-1].target), "")
-        return structs.concatenate(made)
+                part = self.prepare(structs.take(episodes, slice(begin, begin + some)))
+                made.put(begin, part)
+                progress.advance(len(part.target), "")
+        return made.whole
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
         """See `loop.Task`."""

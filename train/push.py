@@ -22,7 +22,7 @@ from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
-from .example_store import IN_MEMORY, Kept, Room
+from .example_store import IN_MEMORY, Filled, Kept, Room
 from .split import Folders, first, load_sides, within
 
 
@@ -114,14 +114,16 @@ class PushTask:
 
     def _prepare_all(self, episodes: PushEpisode) -> Example:
         """Return examples of a whole set, in memory on the host: about 20 KB a push of seven objects."""
-        parts, count = [], len(episodes.fault)
+        count = len(episodes.fault)
+        made = Filled(count)
         with console.Progress("render examples", count, unit="pushes") as progress:
             for begin in range(0, count, batching.BATCH):
                 rows = np.arange(begin, begin + batching.BATCH) % count
                 part: Example = structs.take(self.prepare(structs.take(episodes, rows)), slice(0, count - begin))
-                parts.append(_halved(part))
+                made.put(begin, _halved(part))
                 progress.advance(len(part.taught), "")
-        return structs.concatenate(parts)
+        whole: Example = made.whole
+        return whole
 
     def loss(self, model: nnx.Module, batch: Example, key: jax.Array) -> jax.Array:
         """See `loop.Task`: SmoothL1 in pixels and degrees.

@@ -46,7 +46,7 @@ def load_sides(
       choose: function of the episodes of a data set and its folder that returns those to be used.
 
     Raises:
-      UserError: no folder; or one is damaged, holds something else, or cannot be split.
+      UserError: no folder; one is damaged, holds something else, or cannot be split; or two have scenes in common.
     """
     folders = (data,) if isinstance(data, pathlib.Path) else data
     if not folders:
@@ -56,8 +56,20 @@ def load_sides(
     chosen = [choose(widened(episodes, slots), folder) for (episodes, _), folder in zip(loaded, folders, strict=True)]
     sides = [split(episodes, folder) for episodes, folder in zip(chosen, folders, strict=True)]
     learnt, held = sides[0] if len(sides) == 1 else map(structs.concatenate, map(list, zip(*sides, strict=True)))
+    if len(sides) > 1:
+        _refuse_overlap(learnt, held)
     parts = tuple(len(some.scene.shape) for some, _ in sides)
     return Sides(learnt, held, parts, ":".join(fingerprint for _, fingerprint in loaded))
+
+
+def _refuse_overlap(learnt: Any, held: Any) -> None:
+    """Raise a UserError if a scene of one data set is learnt from and the same scene of another is held out."""
+    known = {size.tobytes() for size in np.asarray(held.scene.size)}
+    if number := sum(size.tobytes() in known for size in np.asarray(learnt.scene.size)):
+        raise UserError(
+            f"--data: {number} episodes would be learnt from whose scenes another of these data sets holds out; give "
+            "one of them, or make one with another --seed"
+        )
 
 
 def first(learnt: Any, limit: int | None, *, what: str) -> Any:

@@ -145,11 +145,11 @@ def warn(text: str) -> None:
 
 
 def require_positive(**values: float) -> None:
-    """Raise a UserError for the first value that is not a number above zero, or larger than any work that ends."""
+    """Raise a UserError for the first value that is no finite number above zero, or counts more than work that ends."""
     for name, value in values.items():
-        if not value > 0:
+        if not 0 < value < float("inf"):
             raise UserError(f"{_option(name)} {value}: want a number above 0")
-        if value > MOST:
+        if isinstance(value, int) and value > MOST:
             raise UserError(f"{_option(name)} {value:.3g}: want a number above 0 and at most {MOST:,}")
 
 

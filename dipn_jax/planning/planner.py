@@ -179,7 +179,7 @@ def _count_actions(
     return decision.replace(is_push=cost < now, value_now=-now, value_push=-cost)
 
 
-@observed.guarded
+@functools.partial(observed.guarded, reach=True)
 @functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "summarize", "estimate"))
 def decide(
     key: Key[Array, ""],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -73,18 +74,25 @@ def is_traced(observation: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(observation))
 
 
-def guarded(function: F) -> F:
-    """Return a compiled function that first checks the observation it is given, unless it is being traced; a decorator.
+def guarded(function: F, *, reach: bool = False) -> F:
+    """Return a compiled function that first checks its argument `observation`, unless it is being traced; a decorator.
 
     A forked process in which JAX would hang is refused, too (`forking.check`).
+
+    Args:
+      function: has an argument `observation`.
+      reach: also refuse a table on which nothing is high enough to be grasped.
     """
+    signature = inspect.signature(function)
 
     @functools.wraps(function)
     def checked(*positional: Any, **named: Any) -> Any:
-        for each in (*positional, *named.values()):
-            if isinstance(each, Observation) and not is_traced(each):
-                forking.check()
-                check_observation(each)
+        given = signature.bind(*positional, **named).arguments["observation"]
+        if not is_traced(given):
+            forking.check()
+            check_observation(given)
+            if reach:
+                require_reach(given)
         return function(*positional, **named)
 
     return cast(F, checked)

@@ -59,6 +59,7 @@ class Partial:
             console.warn(f"{self.path}: damaged, or kept by another version; begins anew")
             return fresh
         if identity != self.identity:
+            console.warn(f"{self.path}: kept with other options or networks than now; begins anew")
             return fresh
         if code != self.code:
             console.warn(f"{self.path}: kept by other sources or versions of packages than now; begins anew")

@@ -88,10 +88,10 @@ def clear(
     from .. import spread
     from . import on_tables
 
+    evaluation.check(out, seed, tables, candidates=candidates, distances=distances, gamma=gamma, threshold=threshold)
     config = PolicyConfig(
         candidates=candidates, distances=distances, gamma=gamma, grasp_above=threshold, released=released, aids=aids
     )
-    evaluation.check(out, seed, config, tables)
     share.check(launch)
     networks, physics = Networks(push_net, grasp_net, value_net), grouped.apart(make_engine(engine, threads=threads))
     if launch.spreads:

@@ -17,7 +17,6 @@ from .tables import SHIPPED, Tables
 
 if TYPE_CHECKING:
     from dipn_jax.engine import Engine
-    from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.storage import resume
 
     from .on_tables import TablePolicy
@@ -40,21 +39,28 @@ def settings(given: dict[str, Any]) -> dict[str, Any]:
     return result | ({} if tables.cases in (*SHIPPED, "random") else {"tables.cases": tables.path()})
 
 
-def check(out: pathlib.Path, seed: int, config: PolicyConfig, tables: Tables) -> None:
+def check(
+    out: pathlib.Path,
+    seed: int,
+    tables: Tables,
+    *,
+    candidates: int,
+    distances: tuple[float, ...],
+    gamma: float,
+    threshold: float,
+) -> None:
     """Raise a UserError for options that make no sense, and a case file that cannot be used."""
     from dipn_jax.planning.policy_config import LONGEST_PUSH
 
-    options.check(out, seed, candidates=config.candidates)
-    console.require_between(1, MAX_CANDIDATES, candidates=config.candidates)
-    if not config.distances:
+    options.check(out, seed, candidates=candidates)
+    console.require_between(1, MAX_CANDIDATES, candidates=candidates)
+    if not distances:
         raise UserError("--distances: want at least one")
-    for distance in config.distances:
+    for distance in distances:
         console.require_between(0.01, LONGEST_PUSH, distances=distance)
-    if config.candidates < len(config.distances):
-        raise UserError(
-            f"--candidates {config.candidates}: want at least one for each of the {len(config.distances)} distances"
-        )
-    console.require_between(0.0, 10.0, gamma=config.gamma, threshold=config.grasp_above)
+    if candidates < len(distances):
+        raise UserError(f"--candidates {candidates}: want at least one for each of the {len(distances)} distances")
+    console.require_between(0.0, 10.0, gamma=gamma, threshold=threshold)
     tables.slots()  # reads the case file
 
 

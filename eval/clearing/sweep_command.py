@@ -86,8 +86,8 @@ def sweep(
 
     every = sweeping.parse(distances)
     console.require_between(0, 100_000, pushes=pushes)
+    evaluation.check(out, seed, tables, candidates=candidates, distances=every, gamma=gamma, threshold=threshold)
     chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold, aids=aids)
-    evaluation.check(out, seed, chosen, tables)
     share.check(launch)
     if pushes and share.of > pushes:
         raise UserError(f"--of {share.of}: more workers than --pushes {pushes}; want at most {pushes}, or --pushes 0")

@@ -1,18 +1,20 @@
 """Examples that are kept in files: the same ones, each made once, taken up again only if they were closed."""
 
 import pathlib
+import shutil
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import cli
+from dipn_jax.train import cli, example_store
 from dipn_jax.train.example_store import ExampleStore, Kept, Room
 from dipn_jax.train.grasp import GraspTask
 from dipn_jax.train.push import PushTask
 
 from dipn_jax import batching
 from dipn_jax.commands import console
+from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 
@@ -49,6 +51,25 @@ def test_each_example_is_made_once_and_the_right_one_is_returned(tmp_path: pathl
     assert maker.made == [5]
     _check(store, list(range(100)))
     assert sorted(maker.made) == sorted({*range(100)} - {3, 7, 99})
+
+
+def test_a_disk_that_is_nearly_full_is_one_line(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, _ = _store(tmp_path / "s")
+    _check(store, [1])
+    full = shutil.disk_usage(tmp_path)._replace(free=int(example_store.SPARE))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
+    with pytest.raises(UserError, match="100 MB are free, too little for more examples; make room"):
+        store.take(np.array([2]))
+    _check(store, [1])
+
+
+def test_examples_that_are_made_in_parts_fill_arrays_of_their_size() -> None:
+    made = example_store.Filled(5)
+    for begin in (0, 2, 4):
+        part = np.arange(begin, min(begin + 2, 5))
+        made.put(begin, {"square": part**2, "half": part.astype(np.float16) / 2})
+    np.testing.assert_array_equal(made.whole["square"], np.arange(5) ** 2)
+    assert made.whole["half"].dtype == np.float16 and made.whole["half"].base is None
 
 
 def test_what_was_closed_is_taken_up_and_nothing_else(

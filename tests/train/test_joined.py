@@ -23,12 +23,14 @@ Data = dict[str, pathlib.Path]
 
 @pytest.fixture
 def wider(data: Data, tmp_path: pathlib.Path) -> Data:
-    """Return data sets with the episodes of `data` in five slots instead of three."""
+    """Return data sets with the episodes of `data` in five slots instead of three, of sizes that nobody can see."""
     made = {}
     for kind in ("push", "images"):
         made[kind] = tmp_path / f"wider-{kind}"
         made[kind].mkdir()
         episodes = widened(records.load(data[kind], kind=kind)[0], 5)
+        size = episodes.scene.size + np.float32(2e-6) * (episodes.scene.size > 0)  # else the scenes would be the same
+        episodes = episodes.replace(scene=episodes.scene.replace(size=size))
         shards.write_shard(made[kind], 0, episodes, kind=kind, config={}, faults={})
         manifest.update_manifest(made[kind])
     return made
@@ -38,8 +40,8 @@ def test_pushes_of_several_data_sets_are_learnt_from(data: Data, wider: Data) ->
     task = PushTask((data["push"], wider["push"]), DipnConfig(), limit=None, centimetres=(5, 10))
     assert task.size == 40 and len(task.test_set.fault) == 8 and task.slots == 5
     one, other = (task.prepare(structs.take(task.train_set, slice(at, at + 2))) for at in (0, 20))
-    np.testing.assert_array_equal(one.inputs.crops, other.inputs.crops)
-    np.testing.assert_array_equal(one.target, other.target)
+    assert (np.asarray(one.inputs.crops) == np.asarray(other.inputs.crops)).mean() > 0.95
+    np.testing.assert_allclose(one.target, other.target, atol=0.05)  # pixels and degrees
     assert not np.asarray(one.inputs.present)[:, 3:].any()
     alone = PushTask(data["push"], DipnConfig(), limit=None, centimetres=(5, 10))
     assert task.fingerprint.startswith(alone.fingerprint.split(":")[0]) and task.fingerprint != alone.fingerprint
@@ -83,8 +85,22 @@ def test_the_command_takes_several_folders_and_names_the_one_that_is_wrong(
         load_sides((), kind="push")
 
 
-def test_a_mix_belongs_to_a_run_and_runs_without_one_go_on(data: Data, tmp_path: pathlib.Path) -> None:
-    task = PushTask((data["push"], data["push"]), DipnConfig(), limit=None, centimetres=(5,))
+def test_what_one_data_set_holds_out_is_not_learnt_from_another(data: Data, tmp_path: pathlib.Path) -> None:
+    """The other has the first scenes of one, and less of them, so that it holds out others."""
+    episodes = structs.take(records.load(data["push"], kind="push")[0], slice(4, 24))
+    order = np.r_[8:20, 0:8]
+    (tmp_path / "other").mkdir()
+    shards.write_shard(tmp_path / "other", 0, structs.take(episodes, order), kind="push", config={}, faults={})
+    manifest.update_manifest(tmp_path / "other")
+    with pytest.raises(
+        UserError, match=r"--data: \d+ episodes would be learnt from whose scenes another of these data sets holds out"
+    ) as said:
+        load_sides((data["push"], tmp_path / "other"), kind="push")
+    assert "\n" not in str(said.value)
+
+
+def test_a_mix_belongs_to_a_run_and_runs_without_one_go_on(data: Data, wider: Data, tmp_path: pathlib.Path) -> None:
+    task = PushTask((data["push"], wider["push"]), DipnConfig(), limit=None, centimetres=(5,))
     plain, mixed = (loop._identity(task, TrainConfig(mix=mix), DEFAULT_COMPUTE, None) for mix in ((), (1.0, 3.0)))
     assert {**mixed, "mix": ()} == {**plain, "mix": ()} and "mix" not in plain
     files.claim(tmp_path, mixed)

@@ -84,6 +84,8 @@ def test_what_decides_and_imagines_refuses_it_too() -> None:
         dipn_jax.imagine(bad, np.zeros((3, 2)), np.zeros((3, 3)))
     with pytest.raises(dipn_jax.UserError, match="1 values are NaN"):
         dipn_jax.decide(jax.random.key(0), bad, None, None, count=2)
+    with pytest.raises(dipn_jax.UserError, match="observation: dict, want a dipn_jax"):
+        dipn_jax.decide(jax.random.key(0), {"height": 1}, None, None, count=2)  # type: ignore[arg-type]
     with pytest.raises(dipn_jax.UserError, match="1 values are NaN"):
         dipn_jax.decide(key=jax.random.key(0), observation=bad, predictor=None, scorer=None)
 
@@ -93,6 +95,8 @@ def test_a_table_on_which_all_lies_flat_is_refused_and_an_empty_one_is_not() -> 
     label[7, 5:9] = 1
     with pytest.raises(dipn_jax.UserError, match="no object is higher than 5 mm, and the fingers close 20 mm above"):
         POLICY(jax.random.key(0), _seen(height=_with(0.005), label=label))
+    with pytest.raises(dipn_jax.UserError, match="no object is higher than 5 mm"):
+        dipn_jax.decide(jax.random.key(0), _seen(height=_with(0.005), label=label), None, None)
     assert POLICY(jax.random.key(0), _seen(height=_with(0.03), label=label)) == "decided"
     assert POLICY(jax.random.key(0), _seen()) == "decided"
 

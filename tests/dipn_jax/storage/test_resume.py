@@ -40,7 +40,7 @@ def test_an_array_of_objects_is_not_run(tmp_path: pathlib.Path) -> None:
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_state_comes_back_as_it_was(tmp_path: pathlib.Path) -> None:
+def test_a_state_comes_back_as_it_was(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = Scene(np.zeros(2, int), np.ones((2, 3)), np.ones((2, 3), np.float32), np.ones(2), np.ones(2))
     missed = (np.array([0.1, np.nan, -np.inf]),)
     table = Instance("a", scene, np.zeros((2, 7)), 2, missed=missed, film=[{"values": np.ones(3, np.float16)}])
@@ -56,6 +56,7 @@ def test_a_state_comes_back_as_it_was(tmp_path: pathlib.Path) -> None:
     np.testing.assert_array_equal(back[1][0].scene.color, scene.color, strict=True)
     assert back[1][0].film[0]["values"].dtype == np.float16
     assert Partial(tmp_path, {"seed": 2}).load("fresh") == "fresh"
+    assert "kept with other options or networks than now; begins anew" in capsys.readouterr().err
 
 
 def test_a_state_of_other_sources_or_a_damaged_one_is_named_and_not_taken_up(
