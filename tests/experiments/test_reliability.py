@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from dipn_jax.system import files
-from experiments import pages, reliability
+from experiments import pages, promises, reliability
 
 ROOT = pathlib.Path(__file__).parent.parent.parent
 VALUES = {
@@ -52,8 +52,8 @@ def test_every_promise_is_a_paragraph_of_short_lines() -> None:
     assert max(map(len, lines)) <= 120
     paragraphs = "\n".join(lines).split("\n\n")
     held = [each for each in paragraphs if " ".join(each.split()).startswith("Held by `tests/")]
-    assert len(held) == len(reliability.PROMISES) == sum(each.startswith("**") for each in paragraphs)
-    assert sum(each.count("`") for each in held) == 2 * sum(len(each.tests) for each in reliability.PROMISES)
+    assert len(held) == len(promises.PROMISES) == sum(each.startswith("**") for each in paragraphs)
+    assert sum(each.count("`") for each in held) == 2 * sum(len(each.tests) for each in promises.PROMISES)
 
 
 def test_what_an_experiment_found_is_put_beside_what_others_found(tmp_path: pathlib.Path) -> None:
