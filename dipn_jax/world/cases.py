@@ -102,7 +102,7 @@ def _case(objects: list[dict[str, Any]], n: int, where: str) -> tuple[Scene, Flo
     shape = np.full(n, ABSENT, np.int32)
     size = np.full((n, 3), 0.05, np.float32)
     color = np.zeros((n, 3), np.float32)
-    poses = np.array(scenes.parked(n))
+    poses, tops, fallen = np.array(scenes.parked(n)), np.zeros(n), np.zeros(n)
     for i, entry in enumerate(objects):
         name = entry.get("shape")
         if name not in shapes.CLASSES:
@@ -141,13 +141,18 @@ def _case(objects: list[dict[str, Any]], n: int, where: str) -> tuple[Scene, Flo
         center = rotation @ (shapes.UNIT_CENTER_OF_MASS[shape[i]] * size[i])  # from the middle of the box
         resting = 0.0005 - float((corners @ rotation[2]).min())
         z = resting if height is None else height + center[2]
-        top = z + float((corners @ rotation[2]).max())
+        poses[i] = np.concatenate([position + center[:2], [z], quat])
+        tops[i] = z + float((corners @ rotation[2]).max())
+        fallen[i] = tops[i] if height is None else resting + float((corners @ rotation[2]).max())
+    for i in range(len(objects)):
+        away = np.linalg.norm(poses[:, :2] - poses[i, :2], axis=-1)
+        near = (shape >= 0) & (away < (np.linalg.norm(size, axis=-1) + np.linalg.norm(size[i])) / 2)
+        top = tops[i] if near.sum() > 1 else fallen[i]  # by itself it falls onto the table
         if top <= LOWEST_TIP:
             raise UserError(
                 f"{where}, object {i}: is {1000 * top:.0f} mm high as it lies, below the gripper's reach: its fingers "
                 f"close {1000 * LOWEST_TIP:.0f} mm above the table; turn it up, or leave it out"
             )
-        poses[i] = np.concatenate([position + center[:2], [z], quat])
     return scenes.nominal(Scene(shape, size, color, np.zeros(n), np.zeros(n))), poses
 
 

@@ -61,8 +61,10 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return folder
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "when"), [("killed at a rename", 3), ("disk full at a sync", 4)])
+@pytest.mark.parametrize(
+    ("kind", "when"),
+    [("killed at a rename", 3), pytest.param("disk full at a sync", 4, marks=pytest.mark.slow)],
+)
 def test_a_command_given_again_after_a_fault_ends_as_an_undisturbed_one(
     kind: str, when: int, out: pathlib.Path
 ) -> None:

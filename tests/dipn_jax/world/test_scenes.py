@@ -124,8 +124,14 @@ def test_sizes_stay_within_bounds_whatever_the_scale() -> None:
 
 def test_a_card_that_the_gripper_cannot_reach_is_refused_as_it_lies(tmp_path: pathlib.Path) -> None:
     card: dict[str, Any] = {"size_mm": [85, 54, 5]}
-    for low in ({}, {"size_mm": [85, 54, 19]}, {"height_m": 0.01}):
+    for low in ({}, {"size_mm": [85, 54, 19]}, {"height_m": 0.01}, {"height_m": 0.06}):
         with pytest.raises(UserError, match=r"case a, object 0: is \d+ mm high as it lies, below the gripper's reach"):
             cases.load_cases(_file(tmp_path, **card | low))
-    for reached in ({"quaternion_wxyz": [1, 1, 0, 0]}, {"size_mm": [85, 54, 25]}, {"height_m": 0.06}):
+    for reached in ({"quaternion_wxyz": [1, 1, 0, 0]}, {"size_mm": [85, 54, 25]}):
         cases.load_cases(_file(tmp_path, **card | reached))
+    path = _file(tmp_path, **card | {"height_m": 0.06})
+    on_block = json.loads(path.read_text())
+    on_block["cases"][0]["objects"].append({**on_block["cases"][0]["objects"][0], "size_mm": [50, 50, 50]})
+    del on_block["cases"][0]["objects"][1]["height_m"]
+    path.write_text(json.dumps(on_block))
+    cases.load_cases(path)
