@@ -35,8 +35,8 @@ def _step_of(line: str) -> float:
 class Log:
     """Writer of a run's learning curve; lines past the restored step are dropped.
 
-    TensorBoard also gets examples a second since the point before, and the most memory in MB that was needed so far:
-    of the device, or of the process where the device is a CPU.
+    TensorBoard and the progress line also get examples a second since the point before, and the most memory in MB that
+    was needed so far: of the device, or of the process where the device is a CPU.
     """
 
     def __init__(self, out: pathlib.Path, begin: int, *, batch: int, writes: bool = True) -> None:
@@ -49,10 +49,10 @@ class Log:
             files.write_text(self.path, "".join(line + "\n" for line in kept))
             self._events = tensorboardX.SummaryWriter(str(out / "events"), purge_step=begin)
 
-    def write(self, step: int, values: dict[str, float]) -> None:
-        """Write a point of the curve, and wait until it is on the disk."""
+    def write(self, step: int, values: dict[str, float]) -> str:
+        """Write a point of the curve, wait until it is on the disk, and return speed and memory in words."""
         if self._events is None:
-            return
+            return ""
         with self.path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps({"step": step, **values}, allow_nan=False) + "\n")
             stream.flush()
@@ -62,6 +62,7 @@ class Log:
         speed = {"examples_per_s": (step - before) * self._batch / max(now - then, 1e-9), **_peak()}
         for name, value in (values | speed).items():
             self._events.add_scalar(name, value, step)
+        return " ".join(f"{name} {value:.0f}" for name, value in speed.items())
 
     def close(self) -> None:
         """Write what is left and close the files."""

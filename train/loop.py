@@ -172,7 +172,7 @@ def _fit(
     step_fn = make_step(task, graph, optimizer, compute=compute)
     curve = log.Log(out, begin, batch=config.batch, writes=where.leads)
     key = seeds.key(config.seed, seeds.Purpose.TRAINING)
-    latest: dict[str, float] = {}
+    latest, speed = dict[str, float](), ""
     watch = finite.Watch(config.learning_rate, lambda k: np.asarray(batches[k]), "the last finite checkpoint is kept")
 
     def save(step: int) -> None:
@@ -202,7 +202,7 @@ def _fit(
                 model.eval()
                 latest = {"loss": float(where.here(loss)), **task.evaluate(model)}
                 watch.check(step, where.here(params), **latest)
-                curve.write(step, latest)
+                speed = curve.write(step, latest)
                 if not best or latest[JUDGE] < best["best"]["value"]:
                     best, due = {"best": {"step": step, "measure": JUDGE, "value": latest[JUDGE]}}, True
             if due:
@@ -210,7 +210,7 @@ def _fit(
             if stopping:
                 saver.wait()
                 raise KeyboardInterrupt
-            progress.advance(1, " ".join(f"{k} {v:.3f}" for k, v in latest.items()))
+            progress.advance(1, " ".join([*(f"{k} {v:.3f}" for k, v in latest.items()), speed]))
     where.wait("done")
     curve.close()
     return latest or log.last(out)

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import online, rounds, split
+from dipn_jax.train import log, online, rounds, split
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_step
 from dipn_jax.train.optimizers import make_optimizer
@@ -205,6 +205,17 @@ def test_the_published_networks_take_a_training_step(data: dict[str, pathlib.Pat
         after = jax.eval_shape(step, params, rest, moments, task.fetch(np.arange(2)), jax.random.key(0))
         assert after[3].shape == ()
         assert jax.tree.structure(after[:2]) == jax.tree.structure((params, rest))
+
+
+def test_speed_and_memory_are_said_beside_the_losses(tmp_path: pathlib.Path) -> None:
+    curve = log.Log(tmp_path, 0, batch=4)
+    curve._at = 0, curve._at[1] - 2.0  # begun two seconds ago
+    said = curve.write(10, {"loss": 0.5})
+    curve.close()
+    name, rate, other, memory = said.split()
+    assert (name, other) == ("examples_per_s", "peak_memory_mb") and 15 <= float(rate) <= 20 and float(memory) > 100
+    assert log.last(tmp_path) == {"step": 10, "loss": 0.5}
+    assert log.Log(tmp_path / "other", 0, batch=4, writes=False).write(10, {"loss": 0.5}) == ""
 
 
 def test_a_hard_stop_inside_a_line_of_metrics_is_survived(task: PushTask, tmp_path: pathlib.Path) -> None:
