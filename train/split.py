@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -64,12 +64,18 @@ def load_sides(
 
 def _refuse_overlap(learnt: Any, held: Any) -> None:
     """Raise a UserError if a scene of one data set is learnt from and the same scene of another is held out."""
-    known = {size.tobytes() for size in np.asarray(held.scene.size)}
-    if number := sum(size.tobytes() in known for size in np.asarray(learnt.scene.size)):
+    known = set(_scenes(held))
+    if number := sum(scene in known for scene in _scenes(learnt)):
         raise UserError(
             f"--data: {number} episodes would be learnt from whose scenes another of these data sets holds out; give "
             "one of them, or make one with another --seed"
         )
+
+
+def _scenes(episodes: Any) -> Iterator[bytes]:
+    """Yield what tells the scene of each episode from others: sizes, masses and frictions, which are drawn for each."""
+    for leaves in zip(episodes.scene.size, episodes.scene.mass, episodes.scene.friction, strict=True):
+        yield b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
 
 
 def first(learnt: Any, limit: int | None, *, what: str) -> Any:
