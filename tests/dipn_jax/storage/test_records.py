@@ -222,3 +222,15 @@ def test_a_shard_of_another_kind_is_named_and_set_aside(data: dict[str, pathlib.
         records.load(copy, kind="push")
     assert records.repair(copy) == [stranger]
     assert not records.verify(copy) and records.summary(copy)["episodes"] == 24
+
+
+def test_shards_with_other_numbers_of_slots_are_one_line(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+    copy = pathlib.Path(shutil.copytree(data["push"], tmp_path / "push"))
+    episodes = shards.read_shard(shards.shard_path(copy, 1), kind="push")
+    scene = episodes.scene.replace(**{name: leaf[:, :2] for name, leaf in vars(episodes.scene).items()})
+    fewer = episodes.replace(scene=scene, poses=episodes.poses[:, :, :2], after=episodes.after[:, :2])
+    shards.write_shard(copy, 1, fewer, kind="push", config={}, faults={})
+    (copy / MANIFEST).unlink()
+    update_manifest(copy)
+    with pytest.raises(UserError, match="shards with 2 and 3 object slots; want one number in a folder"):
+        records.load(copy, kind="push")
