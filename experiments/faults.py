@@ -12,7 +12,9 @@ of `docs/reliability.md` have the counts.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+import math
 import pathlib
 import shutil
 import sys
@@ -59,6 +61,8 @@ KINDS = {
 """The kinds of faults."""
 POINTS = 200
 """Faults that are tried."""
+NEARER = (1.0, 0.75, 0.5, 0.25)
+"""A fault that is not reached, since another thread makes the call this time, is tried at these parts of the way."""
 COUNTED = ("lost", "repeated", "wrong", "damaged", "tracebacks")
 """What is added up over faults."""
 
@@ -166,8 +170,13 @@ def _try(point: Point, case: Case, out: pathlib.Path, code: str) -> None:
     path = out / "points" / f"{point.case}-{point.kind.replace(' ', '_')}-{point.when:04d}.json"
     if path.exists() and files.read_json(path)["code"] == code:
         return
-    found = faults_run.attempt(point, case, KINDS[point.kind], faults_run.reference(case, out), out=out)
-    about = {"case": point.case, "kind": point.kind, "when": point.when, "code": code}
+    whole = faults_run.reference(case, out)
+    for when in dict.fromkeys(math.ceil(part * point.when) for part in NEARER):
+        nearer = dataclasses.replace(point, when=when)
+        found = faults_run.attempt(nearer, case, KINDS[point.kind], whole, out=out)
+        if found["reached"]:
+            break
+    about = {"case": point.case, "kind": point.kind, "when": when, "code": code}
     files.write_json(path, about | found)
     if any(found[name] for name in COUNTED):
         console.say(json.dumps(about | {name: found[name] for name in (*COUNTED, "codes")}))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dipn_jax.storage import shards
+from dipn_jax.system import files
 from experiments import faults, faults_run
 from experiments.faults_run import Case, Point, Result
 
@@ -35,6 +36,26 @@ def test_counts_are_added_by_command_and_kind() -> None:
     none = dict.fromkeys(faults.COUNTED, 0)
     tried = [{"case": "a", "kind": "k", "reached": reached, **none, "lost": 2} for reached in (1, 0, 1)]
     assert faults.summary(tried) == {"a": {"k": {"tried": 2, **none, "lost": 6}}}
+
+
+def test_a_fault_that_is_not_reached_is_tried_nearer(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def attempt(point: Point, *_: object, **__: object) -> dict[str, object]:
+        tried.append(point.when)
+        return {"reached": int(point.when <= 5), **dict.fromkeys(faults.COUNTED, 0), "codes": [-9, 0]}
+
+    monkeypatch.setattr(faults_run, "attempt", attempt)
+    monkeypatch.setattr(faults_run, "reference", lambda *_: Result([], {}))
+    (tmp_path / "points").mkdir()
+    kind = "killed at a write"
+    faults._try(Point("generate", kind, 9), SMALL, tmp_path, "these")
+    faults._try(Point("generate", kind, 9), SMALL, tmp_path, "these")  # it has been tried with these sources
+    assert tried == [9, 7, 5]
+    (kept,) = (tmp_path / "points").iterdir()
+    assert files.read_json(kept)["when"] == 5
+    faults._try(Point("generate", "killed at a sync", 1), SMALL, tmp_path, "these")
+    assert tried == [9, 7, 5, 1]
 
 
 def test_a_file_that_is_not_whole_is_noticed(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
