@@ -1,15 +1,15 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html
-# make test   lint, types and the quick tests; make test-slow: the others, which compile, train or simulate for long
+# make test   lint, types and the quick tests; make test-slow: those that compile, train or simulate for long
+# make test-pages  every command of the pages in docs at small scale (half an hour)
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
-# make mutants, make fuzz, make faults  the counts of docs/testing.md and docs/reliability.md (hours)
-# make push-figures, grasp-figures, clear-figures  those of docs/push-prediction.md, grasping.md, clearing.md
+# make mutants, fuzz, faults; push-figures, grasp-figures, clear-figures  the counts and figures of pages (hours)
 PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 INSTALL := $(BIN)/pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e
 
-.PHONY: setup demo test test-slow lint bench mutants fuzz faults push-figures grasp-figures clear-figures help
+.PHONY: setup demo test test-slow test-pages lint bench mutants fuzz faults push-figures grasp-figures clear-figures help
 help: ; @sed -n 's/^# make/make/p' Makefile
 
 setup: .venv/.installed
@@ -18,9 +18,9 @@ setup: .venv/.installed
 	$(INSTALL) '.[dev]'
 	touch $@
 
-test: setup lint ; $(PYTEST) -m "not slow"
+test: setup lint ; $(PYTEST) -m "not slow and not pages"
 test-slow: setup ; $(PYTEST) -m slow
-
+test-pages: setup ; $(PYTEST) -m pages
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

@@ -39,12 +39,14 @@ def _fuzz(values: dict[str, Any]) -> str:
     if not found:
         return "not run"
     inputs, tracebacks = (sum(each[name] for each in found) for name in ("inputs", "tracebacks"))
-    return f"{inputs:,} inputs: {tracebacks:,} tracebacks"
+    return f"{inputs:,} damaged inputs: {tracebacks:,} tracebacks"
 
 
 def _checkpoints(values: dict[str, Any]) -> str:
     found = values.get("checkpoints")
-    return f"{found['damaged']} damaged: {found['recovered']} runs went on with the step before" if found else "not run"
+    if not found:
+        return "not run"
+    return f"{found['damaged']} damaged checkpoints: {found['recovered']} runs continued with the step before"
 
 
 _STORAGE = "tests/dipn_jax/storage"

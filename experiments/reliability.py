@@ -19,7 +19,7 @@ from typing import Any
 
 from dipn_jax.commands import console, markdown
 from dipn_jax.errors import UserError
-from dipn_jax.system import files
+from dipn_jax.system import files, machine
 from experiments import pages, promises
 
 PAGE = "reliability"
@@ -28,7 +28,7 @@ PAGE = "reliability"
 
 def section(values: dict[str, Any]) -> str:
     """Return the page's list of promises and its table of faults as Markdown, from its JSON."""
-    paragraphs = []
+    paragraphs = [f"Tried: {'; '.join(each.counted(values) for each in promises.PROMISES if each.counted)}."]
     for promise in promises.PROMISES:
         paragraphs += [f"**{promise.text}**", f"Held by {', '.join(f'`{test}`' for test in promise.tests)}."]
         if promise.counted:
@@ -42,11 +42,26 @@ def section(values: dict[str, Any]) -> str:
     return "\n\n".join([*wrapped, "## Faults by command", markdown.table(["command", "fault", *columns], rows)])
 
 
+def box(values: dict[str, Any]) -> str:
+    """Return the page's box as Markdown: with what each count was made, from its JSON."""
+    fuzzed: dict[str, list[str]] = {}
+    for parser, found in values.get("fuzz", {}).items():
+        about = f"commit {found['commit']}, seed {found['seed']}"
+        fuzzed.setdefault(about, []).append(parser)
+    lines = [f"{', '.join(parsers)}: {about}" for about, parsers in fuzzed.items()]
+    if len(lines) == 1:
+        lines = [f"inputs: {about}" for about in fuzzed]
+    for name, made in (("faults", values.get("faults", {}).get(pages.MADE)), ("damaged", values.get("checkpoints"))):
+        lines += [f"{name}: commit {made['commit']}, {made['processor']}"] if made else []
+    wrapped = [textwrap.fill(line, pages.BOX_WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in lines]
+    return "\n".join(["```", *wrapped, "```"]) + "\n"
+
+
 def write(key: str, found: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
     """Put what an experiment found into `reliability.json` under its key, and its section into `reliability.md`."""
     path, page = docs / f"{PAGE}.json", docs / f"{PAGE}.md"
     values = (files.read_json(path) if path.exists() else {}) | {key: found}
-    text = pages.with_tables(files.read_text(page), section(values))
+    text = pages.with_box(pages.with_tables(files.read_text(page), section(values)), box(values))
     files.write_json(path, values)
     files.write_text(page, text)
 
@@ -139,7 +154,8 @@ def _work(options: argparse.Namespace) -> int:
         return 0
     with tempfile.TemporaryDirectory() as folder:
         two_steps(pathlib.Path(folder))
-        write("checkpoints", found := damage(pathlib.Path(folder)))
+        found = damage(pathlib.Path(folder))
+    write("checkpoints", found | {"commit": machine.commit(), "processor": machine.processor()})
     console.say(f"checkpoints: {found['recovered']} of {found['damaged']}")
     return 0
 

@@ -4,14 +4,13 @@ import contextlib
 import functools
 import importlib
 import importlib.util
-import json
 import pathlib
 import re
-import shlex
 import shutil
 from collections.abc import Callable
 
 import numpy as np
+import page_commands
 import pytest
 import tyro
 from dipn_jax.datagen.exporting.export import NEEDS
@@ -27,39 +26,8 @@ from experiments import moving_picture, runs, tutorial_pictures
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
-BIN = ".venv/bin/"
-SHELL = re.compile(r"^```bash\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
-SMALL = {
-    "--episodes": "24", "--steps": "2", "--objects": "1:3", "--candidates": "4", "--distances": "0.05:0.1:0.05",
-    "--scenes": "2", "--instances": "1", "--limit": "12",
-}  # fmt: skip
-"""Options that make a command of the tutorial large, and the smaller ones of the test."""
-ALWAYS = {
-    "dipn-datagen": ["--objects", "1:3", "--shard-size", "24", "--episodes", "24"],
-    "dipn-train": ["--steps", "2", "--batch", "4", "--eval-every", "2", "--save-every", "2"],
-    "dipn-eval": [],
-}
-"""Options that a test adds to those commands where they make or learn something."""
-MAINTENANCE = ("info", "verify", "repair", "export", "replay")
-"""Commands that make and learn nothing, and take none of those options."""
-RUN = {
-    "data_sets.md": ("push", *MAINTENANCE),
-    "your_network.md": ("push", "images", "export"),
-    "weights_elsewhere.md": ("export",),
-    "sweep_distance.md": ("push",),
-    "your_cases.md": ("push", "grasp"),
-    "engines.md": ("push",),
-}
-"""Page of how-tos -> its commands that a test runs; those of the others, and all else there, are only parsed."""
-
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-
-
-def commands(page: pathlib.Path) -> list[list[str]]:
-    """Return the words of every shell command on a page, without `.venv/bin/` and comments."""
-    lines = "\n".join(block[1] for block in SHELL.finditer(page.read_text())).replace("\\\n", " ").splitlines()
-    return [[word.removeprefix(BIN) for word in shlex.split(line, comments=True)] for line in lines if line.strip()]
 
 
 def parsed(words: list[str]) -> bool:
@@ -103,7 +71,7 @@ def test_files_of_this_project_that_a_page_names_exist(page: pathlib.Path) -> No
 @each_page
 def test_commands_on_pages_exist(page: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
     makefile = (ROOT / "Makefile").read_text()
-    for words in commands(page):
+    for words in page_commands.commands(page):
         match words:
             case ["make", *targets]:
                 named = [target for target in targets if "=" not in target]  # the others are variables
@@ -152,14 +120,13 @@ def prepare(folder: pathlib.Path, data: dict[str, pathlib.Path]) -> None:
     shutil.copytree(data["push"], folder / "data" / "push")
     for run, network in (("dipn", "dipn"), ("gn", "grasp")):
         shutil.copytree(ROOT / "dipn_jax" / "data" / network, folder / "runs" / run)
-    page = (ROOT / "docs" / "howto" / "your_cases.md").read_text()
-    cases = json.loads(re.search(r"^```json\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)[1])  # type: ignore[index]
-    (folder / "my_cases.json").write_text(json.dumps(cases))
+    cases = page_commands.block(ROOT / "docs" / "howto" / "your_cases.md", "json")
+    (folder / "my_cases.json").write_text(cases)
 
 
 def export_all(page: pathlib.Path) -> None:
     """Run the commands of a page that export a data set in formats whose libraries are there."""
-    for program, *arguments in commands(page):
+    for program, *arguments in page_commands.commands(page):
         form = arguments[arguments.index("--format") + 1] if "--format" in arguments else "parquet"
         if all(importlib.util.find_spec(name) for name in NEEDS.get(form, ())):
             assert console.run(program, importlib.import_module(runs.PROGRAMS[program]).COMMANDS, arguments) == 0
@@ -200,64 +167,3 @@ def test_the_tutorial_clears_its_table(tmp_path: pathlib.Path) -> None:
     assert names["actions"][0] == "push" and names["actions"].count("grasp") == 4
     made = {path.name for path in (tmp_path / "tutorial").iterdir()}
     assert made == {path.name for path in (ROOT / "docs" / "tutorial").iterdir()}
-
-
-def smaller(words: list[str]) -> tuple[str, ...]:
-    """Return a command of the tutorial or a how-to, made small."""
-    program, name, *rest = words
-    options = [
-        word if before == "--distances" and ":" not in word else SMALL.get(before, word)
-        for before, word in zip(["", *rest], rest, strict=False)
-    ]
-    extra = ALWAYS[program] if name != "images" else ["--shard-size", "24"]
-    extra = [] if name in MAINTENANCE else extra
-    given = set(options)
-    for option, value in zip(extra[::2], extra[1::2], strict=True):
-        options += [] if option in given else [option, value]
-    if name == "clear" and "runs/dipn" in options:
-        options += ["--names", "06", "--candidates", "4"]
-    return (program, name, *options)
-
-
-@pytest.mark.slow
-def test_the_commands_from_data_to_cleared_tables_work_at_small_scale(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(moving_picture, "PERIOD", 0.5)
-    monkeypatch.setattr(moving_picture, "HOLD_FRAMES", 2)
-    recipe = commands(ROOT / "docs" / "howto" / "your_network.md")
-    recipe = recipe[: [words[-1] for words in recipe].index("results/hard") + 1]
-    recipe = [words for words in recipe if words[:2] not in (["dipn-eval", "prediction"], ["dipn-eval", "grasp"])]
-    for words in commands(ROOT / "docs" / "tutorial.md") + recipe:
-        if words[0] == "python":
-            moving_picture.main(pathlib.Path("results/picture"), pathlib.Path("results/clearing.gif"))
-        else:
-            program, *arguments = smaller(words)
-            known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
-            assert console.run(program, known, arguments) == 0, words
-    report = pathlib.Path("results/report/report.html")
-    assert report.exists() and pathlib.Path("results/clearing.gif").stat().st_size < 1.5e6
-    assert files.read_json(pathlib.Path("results/hard/metrics.json"))["instances"] == 1
-
-
-@pytest.mark.slow
-def test_commands_of_howtos_work_at_small_scale(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the commands in `RUN`, in one folder.
-
-    All other commands of how-tos are parsed by `test_commands_on_pages_exist`: they clear tables, measure, learn
-    grasps or need another engine, which takes minutes even when it is made small, or the tutorial runs the same.
-    """
-    monkeypatch.chdir(tmp_path)
-    for name, wanted in RUN.items():
-        done = set()
-        for words in commands(ROOT / "docs" / "howto" / name):
-            if words[1] not in wanted or {"paper", "found", "mjx", "vpg"} & set(words):
-                continue
-            program, *arguments = smaller(words)
-            known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
-            assert console.run(program, known, arguments) == 0, words
-            done.add(words[1])
-        assert done == set(wanted) & {words[1] for words in commands(ROOT / "docs" / "howto" / name)}, name
-    assert files.read_json(pathlib.Path("data/sweep/config.json"))["distances"] == [0.03, 0.06, 0.1]
-    assert any(pathlib.Path("exported/dipn").iterdir()) and pathlib.Path("exported/gn.safetensors").is_file()

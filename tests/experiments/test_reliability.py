@@ -13,12 +13,15 @@ from experiments import pages, promises, reliability
 ROOT = pathlib.Path(__file__).parent.parent.parent
 VALUES = {
     "faults": {
-        "made": {"commit": "abc"},
+        "made": {"commit": "abc", "processor": "Some"},
         "push": {"killed": {"tried": 3, "lost": 1, "repeated": 0, "wrong": 1, "damaged": 0, "tracebacks": 0}},
         "clear": {"killed": {"tried": 4, "lost": 0, "repeated": 2, "wrong": 0, "damaged": 0, "tracebacks": 0}},
     },
-    "fuzz": {"shard": {"inputs": 1000, "tracebacks": 1}, "meta": {"inputs": 500, "tracebacks": 0}},
-    "checkpoints": {"damaged": 8, "recovered": 7},
+    "fuzz": {
+        "shard": {"inputs": 1000, "tracebacks": 1, "seed": 0, "commit": "def"},
+        "meta": {"inputs": 500, "tracebacks": 0, "seed": 0, "commit": "abc"},
+    },
+    "checkpoints": {"damaged": 8, "recovered": 7, "commit": "ghi", "processor": "Other"},
 }
 
 
@@ -37,13 +40,25 @@ def test_every_test_that_the_page_names_exists() -> None:
 def test_the_section_in_docs_is_that_of_the_kept_counts() -> None:
     text = (ROOT / "docs" / "reliability.md").read_text()
     assert pages.with_tables(text, reliability.section(_kept())) == text
+    assert pages.with_box(text, reliability.box(_kept())) == text
+
+
+def test_the_box_says_of_every_count_how_it_was_made() -> None:
+    lines = reliability.box(VALUES).splitlines()[1:-1]
+    assert lines[:2] == ["shard: commit def, seed 0", "meta: commit abc, seed 0"]
+    assert lines[2:] == ["faults: commit abc, Some", "damaged: commit ghi, Other"]
+    alike = {name: found | {"commit": "abc"} for name, found in VALUES["fuzz"].items()}
+    assert reliability.box({"fuzz": alike}).splitlines()[1:-1] == ["inputs: commit abc, seed 0"]
 
 
 def test_the_counts_of_all_commands_are_added() -> None:
-    text = reliability.section(VALUES)
+    text = " ".join(reliability.section(VALUES).split())
     said = "7 faults: 1 records lost, 2 repeated, 1 results wrong, 0 files damaged, 0 tracebacks"
-    assert said in text and "1,500 inputs: 1 tracebacks" in text
-    assert "8 damaged: 7 runs went on" in text and "| clear | killed | 4 | 0 | 2 | 0 | 0 | 0 |" in text
+    assert text.count(said) == 2 and text.count("1,500 damaged inputs: 1 tracebacks") == 2
+    assert (
+        text.count("8 damaged checkpoints: 7 runs continued") == 2
+        and "| clear | killed | 4 | 0 | 2 | 0 | 0 | 0 |" in text
+    )
     assert reliability.section({}).count("Tried: not run.") == 3
 
 
