@@ -21,7 +21,8 @@ from .sweep_command import sweep
 if TYPE_CHECKING:
     from flax import nnx
 
-    from .example_store import Room
+    from dipn_jax.storage.space import Space
+
     from .loop import Task
     from .split import Folders
 
@@ -55,17 +56,17 @@ def _begin(data: Folders, config: TrainConfig, out: pathlib.Path, compute: Compu
 
 
 @contextlib.contextmanager
-def _room(out: pathlib.Path, compute: Compute) -> Iterator[Room]:
-    """Yield where the examples of a run are kept: in its folder, or in a temporary one if it is only compiled."""
+def _space(out: pathlib.Path, compute: Compute) -> Iterator[Space]:
+    """Yield where the data of a run is kept, with files in its folder, or in a temporary one if it is only compiled."""
     import jax
 
-    from .example_store import Room
+    from dipn_jax.storage.space import Space
 
     if compute.compile_only:
         with tempfile.TemporaryDirectory() as folder:
-            yield Room(0, pathlib.Path(folder) / "examples")
+            yield Space(0, pathlib.Path(folder) / "examples")
     else:
-        yield Room(compute.memory, out / "examples" / str(jax.process_index()))
+        yield Space(compute.memory, out / "examples" / str(jax.process_index()))
 
 
 def _local(data: Folders) -> tuple[pathlib.Path, ...]:
@@ -122,9 +123,9 @@ def push(
 
     found, initial = masks == "found", _initial(init, "dipn")
     network = initial.config if initial else DipnConfig(preset=preset)
-    with _room(out, compute) as room:
+    with _space(out, compute) as space:
         task = PushTask(
-            _local(data), network, limit=limit, centimetres=centimetres, without=without, found=found, room=room
+            _local(data), network, limit=limit, centimetres=centimetres, without=without, found=found, space=space
         )
         with contextlib.closing(task):
             _fit(task, config, out, compute, initial=initial)
@@ -158,7 +159,8 @@ def grasp_pretrain(
 
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
-    _fit(PretrainTask(_local(data), network), config, out, compute, initial=initial)
+    with _space(out, compute) as space:
+        _fit(PretrainTask(_local(data), network, space=space), config, out, compute, initial=initial)
 
 
 def grasp(
@@ -192,8 +194,8 @@ def grasp(
     initial = _initial(init, "grasp")
     network = initial.config if initial else GraspConfig(preset=preset)
     with (
-        _room(out, compute) as room,
-        contextlib.closing(GraspTask(_local(data), network, limit=limit, room=room)) as task,
+        _space(out, compute) as space,
+        contextlib.closing(GraspTask(_local(data), network, limit=limit, space=space)) as task,
     ):
         _fit(task, config, out, compute, initial=initial)
 

@@ -78,8 +78,9 @@ class Compute:
     precision: Literal["float32", "bfloat16"] = "float32"
     """Precision of what the network's layers compute; weights, statistics and losses stay float32."""
     memory: float = 8.0
-    """GB of examples kept in memory, by push and grasp with compact networks. If there are more, each is made when it
-    is first used and kept in files under OUT/examples; these may be deleted afterwards."""
+    """GB of episodes, and of examples of push and grasp with compact networks, kept in memory. If episodes need more,
+    they are kept in files that are gone when the command ends; if examples do, each is made when it is first used and
+    kept in files under OUT/examples, which may be deleted afterwards."""
     compile_only: bool = False
     """Compile a step, say what memory it needs, and write nothing but the compiled program that JAX keeps."""
     check_only: bool = False

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import pathlib
 import shutil
 from collections.abc import Callable
@@ -14,27 +12,13 @@ import numpy as np
 
 from dipn_jax import batching, structs
 from dipn_jax.commands import console
-from dipn_jax.errors import UserError
+from dipn_jax.storage.space import Space, require_room
 from dipn_jax.system import files
 
 _LARGEST = 1e6
 """Bytes that an example takes at most: tenfold those of a push of thirty objects."""
-SPARE = 100e6
-"""Bytes that are left free on the disk where examples are kept."""
 _WHOLE = "whole.json"
 """File that says what the examples are of, and that none was cut off while it was written."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Room:
-    """Where examples are kept."""
-
-    memory: float = math.inf  # GB that they may take in memory
-    folder: pathlib.Path | None = None  # where they are kept if they need more; None: in memory all the same
-
-
-IN_MEMORY = Room()
-"""In memory, however large they are."""
 
 
 class Kept:
@@ -46,7 +30,7 @@ class Kept:
         make_all: Callable[[], Any],
         count: int,
         *,
-        room: Room,
+        space: Space,
         about: str,
     ) -> None:
         """Prepare to keep examples; `ExampleStore` explains what is not explained here.
@@ -55,10 +39,10 @@ class Kept:
           make: as of `ExampleStore`.
           make_all: function that returns all examples as `make` makes them, and shows how far it is.
           count: number of examples.
-          room: where to keep them.
+          space: where to keep them; files are kept in its folder.
           about: as of `ExampleStore`.
         """
-        self._make, self._make_all, self._count, self._room, self._about = make, make_all, count, room, about
+        self._make, self._make_all, self._count, self._space, self._about = make, make_all, count, space, about
         self._all: Any = None
         self._store: ExampleStore | None = None
 
@@ -69,15 +53,15 @@ class Kept:
         return structs.take(self._all, index) if self._store is None else self._store.take(index)
 
     def _begin(self) -> None:
-        folder = self._room.folder
-        if folder is not None and self._size() > 1e9 * self._room.memory:
+        folder = self._space.folder
+        if folder is not None and not self._space.fits(self._size()):
             self._store = ExampleStore(folder, self._make, self._count, about=self._about)
         else:
             self._all = self._make_all()
 
     def _size(self) -> float:
         """Return the bytes that all examples take; 0 if they fit in any case."""
-        if self._count * _LARGEST <= 1e9 * self._room.memory:
+        if self._space.fits(self._count * _LARGEST):
             return 0.0
         some = jax.tree.leaves(self._make(_filled(np.zeros(1, int))))
         return self._count * sum(np.asarray(leaf).nbytes / len(leaf) for leaf in some)
@@ -86,22 +70,6 @@ class Kept:
         """See `ExampleStore.close`."""
         if self._store is not None:
             self._store.close()
-
-
-class Filled:
-    """Examples that are made in parts, in arrays that are made once: no more memory than they need."""
-
-    def __init__(self, count: int) -> None:
-        self.whole: Any = None
-        self._count = count
-
-    def put(self, begin: int, part: Any) -> None:
-        """Put examples, a struct with a leading `[B]`, at the numbers from `begin` on."""
-        part = jax.tree.map(np.asarray, part)
-        if self.whole is None:
-            self.whole = jax.tree.map(lambda leaf: np.empty((self._count, *leaf.shape[1:]), leaf.dtype), part)
-        for array, leaf in zip(jax.tree.leaves(self.whole), jax.tree.leaves(part), strict=True):
-            array[begin : begin + len(leaf)] = leaf
 
 
 class ExampleStore:
@@ -133,21 +101,13 @@ class ExampleStore:
         *leaves, made = arrays
         missing = np.unique(index[~made[index]])
         if len(missing):
-            self._require_room(sum(array[:1].nbytes for array in leaves) * len(missing))
+            size = sum(array[:1].nbytes for array in leaves) * len(missing)
+            require_room(self._folder, size, what="more examples")
             rows = _filled(missing)
             for array, leaf in zip(leaves, jax.tree.leaves(self._make(rows)), strict=True):
                 array[missing] = np.asarray(leaf)[: len(missing)]
             made[missing] = True
         return jax.tree.unflatten(self._structure, [np.asarray(array[index]) for array in leaves])
-
-    def _require_room(self, size: int) -> None:
-        """Raise a UserError where the disk has no room for `size` bytes; a mapped file would end the process there."""
-        free = shutil.disk_usage(self._folder).free
-        if free < size + SPARE:
-            raise UserError(
-                f"{self._folder}: {free / 1e6:.0f} MB are free, too little for more examples; make room and give the "
-                "same command again, or give a larger --memory"
-            )
 
     def _open(self, some: Any) -> None:
         """Map the files, which are made if those of another process cannot be taken up; `some` examples show shapes."""

@@ -16,11 +16,12 @@ from dipn_jax.commands import console
 from dipn_jax.networks import grasp, losses
 from dipn_jax.sight import fingers, render
 from dipn_jax.storage import plain
+from dipn_jax.storage.space import Filled, Space
 from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
-from .example_store import IN_MEMORY, Filled, Kept, Room
+from .example_store import Kept
 from .split import Folders, first, load_sides, within
 
 PRETRAIN_VIEW = 192
@@ -58,8 +59,15 @@ class PretrainTask:
 
     network = "grasp"
 
-    def __init__(self, data: Folders, config: grasp.GraspConfig) -> None:
-        sides = load_sides(data, kind="images")
+    def __init__(self, data: Folders, config: grasp.GraspConfig, *, space: Space | None = None) -> None:
+        """Load data sets.
+
+        Args:
+          data: folders of images; the last tenth of each is held out.
+          config: architecture.
+          space: where the scenes are kept; None: in memory.
+        """
+        sides = load_sides(data, kind="images", space=space)
         self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
         self.size, self.parts = len(self.train_set.fault), sides.parts
         self.examples = self.size + len(self.test_set.fault)
@@ -190,7 +198,7 @@ class GraspTask:
     network = "grasp"
 
     def __init__(
-        self, data: Folders, config: grasp.GraspConfig, *, limit: int | None = None, room: Room = IN_MEMORY
+        self, data: Folders, config: grasp.GraspConfig, *, limit: int | None = None, space: Space | None = None
     ) -> None:
         """Load data sets.
 
@@ -198,27 +206,28 @@ class GraspTask:
           data: folders of grasp episodes; the last tenth of each is held out.
           config: architecture.
           limit: learn from this number of episodes only, the first ones; the same ones are held out.
-          room: where the windows of a `compact` network are kept.
+          space: where episodes, and the windows of a `compact` network, are kept; None: in memory.
 
         Raises:
           UserError: no folder; one is damaged, or holds something else; or they have fewer episodes.
         """
-        sides = load_sides(data, kind="grasp")
+        space = space or Space()
+        sides = load_sides(data, kind="grasp", space=space)
         self.train_set, self.test_set = first(sides.learnt, limit, what="grasps"), sides.held_out
         self.fingerprint = sides.fingerprint if limit is None else f"{sides.fingerprint}:{limit}"
         self.size = self.examples = len(self.train_set.fault)
         self.parts = within(sides.parts, self.size)
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
-        self._kept = self._keeper(self.train_set, room)
-        self._held_out = self._keeper(self.test_set, IN_MEMORY)
+        self._kept = self._keeper(self.train_set, space)
+        self._held_out = self._keeper(self.test_set, Space())
 
-    def _keeper(self, episodes: GraspEpisode, room: Room) -> Kept:
+    def _keeper(self, episodes: GraspEpisode, space: Space) -> Kept:
         def make(index: np.ndarray) -> Window:
             return self.prepare(structs.take(episodes, index))
 
         count = len(episodes.fault)
-        return Kept(make, lambda: self._prepare_all(episodes), count, room=room, about=self.fingerprint)
+        return Kept(make, lambda: self._prepare_all(episodes, space), count, space=space, about=self.fingerprint)
 
     def prepare(self, episodes: GraspEpisode) -> Window:
         """Return windows `[B]` of episodes `[B]` as NumPy arrays."""
@@ -238,9 +247,9 @@ class GraspTask:
         taken: Window = kept.take(index)
         return taken
 
-    def _prepare_all(self, episodes: GraspEpisode) -> Window:
+    def _prepare_all(self, episodes: GraspEpisode, space: Space) -> Window:
         count, some = len(episodes.fault), 8 * batching.BATCH
-        made = Filled(count)
+        made = Filled(count, space, what="examples")
         with console.Progress("render windows", count, unit="grasps") as progress:
             for begin in range(0, count, some):
                 part = self.prepare(structs.take(episodes, slice(begin, begin + some)))

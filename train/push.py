@@ -18,11 +18,12 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, losses, push_frame
 from dipn_jax.networks.push_frame import PushInput, View
 from dipn_jax.sight import render, segment
+from dipn_jax.storage.space import Filled, Space
 from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
-from .example_store import IN_MEMORY, Filled, Kept, Room
+from .example_store import Kept
 from .split import Folders, first, load_sides, within
 
 
@@ -49,7 +50,7 @@ class PushTask:
         centimetres: tuple[int, ...],
         without: tuple[str, ...] = (),
         found: bool = False,
-        room: Room = IN_MEMORY,
+        space: Space | None = None,
     ) -> None:
         """Load data sets.
 
@@ -60,17 +61,18 @@ class PushTask:
           centimetres: distances learnt, each 1 to 10.
           without: leave out scenes with an object of these classes (`shapes.CLASSES`).
           found: masks are found in the image by `segment`, not taken from the simulator.
-          room: where the examples of a `compact` network are kept.
+          space: where episodes, and the examples of a `compact` network, are kept; None: in memory.
         """
         if not centimetres or min(centimetres) < 1 or max(centimetres) > PUSH_STEPS:
             raise UserError(
                 f"--centimetres {' '.join(map(str, centimetres))}: want whole numbers from 1 to {PUSH_STEPS}"
             )
 
-        def choose(episodes: PushEpisode, folder: pathlib.Path) -> PushEpisode:
+        def choose(episodes: PushEpisode, folder: pathlib.Path) -> np.ndarray | None:
             return _chosen(episodes, folder, centimetres, without)
 
-        sides = load_sides(data, kind="push", choose=choose)
+        space = space or Space()
+        sides = load_sides(data, kind="push", choose=choose, space=space)
         self.train_set, self.test_set = first(sides.learnt, limit, what="pushes"), sides.held_out
         count = len(self.train_set.fault)
         self.network_config = config
@@ -82,7 +84,7 @@ class PushTask:
         self.found = found
         self.slots = sides.slots
         self._kept = Kept(
-            self._some, lambda: self._prepare_all(self.train_set), count, room=room, about=self.fingerprint
+            self._some, lambda: self._prepare_all(self.train_set, space), count, space=space, about=self.fingerprint
         )
         self._held_out: Example | None = None
 
@@ -112,10 +114,10 @@ class PushTask:
         view = self.network_config.view
         return _examples(label, height, episodes, counted, self.centimetres, slots=self.slots, view=view)
 
-    def _prepare_all(self, episodes: PushEpisode) -> Example:
-        """Return examples of a whole set, in memory on the host: about 20 KB a push of seven objects."""
+    def _prepare_all(self, episodes: PushEpisode, space: Space) -> Example:
+        """Return examples of a whole set, on the host: about 20 KB a push of seven objects."""
         count = len(episodes.fault)
-        made = Filled(count)
+        made = Filled(count, space, what="examples")
         with console.Progress("render examples", count, unit="pushes") as progress:
             for begin in range(0, count, batching.BATCH):
                 rows = np.arange(begin, begin + batching.BATCH) % count
@@ -157,7 +159,7 @@ class PushTask:
         graph, state = nnx.split(model)
         size, count = 32, len(self.test_set.fault)
         if self._held_out is None and self.network_config.preset != "paper":
-            self._held_out = self._prepare_all(self.test_set)
+            self._held_out = self._prepare_all(self.test_set, Space())
         for begin in range(0, count, size):
             index = np.arange(begin, begin + size) % count
             weight = np.arange(begin, begin + size) < count
@@ -173,23 +175,24 @@ class PushTask:
 
 def _chosen(
     episodes: PushEpisode, folder: pathlib.Path, centimetres: tuple[int, ...], without: tuple[str, ...]
-) -> PushEpisode:
-    """Return the episodes of a data set without those that have an object of some classes.
+) -> np.ndarray | None:
+    """Return the numbers of those episodes that have no object of some classes; None for all.
 
     Raises:
       UserError: none is left, or pushes are shorter than the distances that are to be learnt.
     """
+    kept, distances = None, episodes.push.distance
     if without:
         classes = [shapes.CLASSES.index(name) for name in without]
         kept = np.flatnonzero(~np.isin(episodes.scene.shape, classes).any(1))
         if not len(kept):
             raise UserError(f"--without {' '.join(without)}: leaves none of the pushes of {folder}; name fewer classes")
-        episodes = structs.take(episodes, kept)
-    shortest = 100 * float(np.min(episodes.push.distance))
+        distances = distances[kept]
+    shortest = 100 * float(np.min(distances))
     if min(centimetres) > shortest + 0.01:
         given = " ".join(map(str, centimetres))
         raise UserError(f"--centimetres {given}: {folder} has pushes of {shortest:.0f} cm; give as low a number")
-    return episodes
+    return kept
 
 
 def _mirrored(key: jax.Array, inputs: PushInput, target: Array) -> tuple[PushInput, jax.Array]:

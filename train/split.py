@@ -13,11 +13,16 @@ import numpy as np
 from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.storage import held_out, records
+from dipn_jax.storage.space import Filled, Space
 from dipn_jax.structs import ABSENT, Array
 from dipn_jax.world import scenes
 
 Folders = pathlib.Path | tuple[pathlib.Path, ...]
 """One data set, or several."""
+Choose = Callable[[Any, pathlib.Path], np.ndarray | None]
+"""Function of the episodes of a data set and its folder: the numbers of those that are used, or None for all."""
+_SOME = 10_000
+"""Episodes that are copied at a time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,15 +40,14 @@ class Sides:
         return int(self.learnt.scene.shape.shape[1])
 
 
-def load_sides(
-    data: Folders, *, kind: str, choose: Callable[[Any, pathlib.Path], Any] = lambda episodes, _: episodes
-) -> Sides:
+def load_sides(data: Folders, *, kind: str, choose: Choose = lambda *_: None, space: Space | None = None) -> Sides:
     """Load data sets and split each; they may have different numbers of object slots.
 
     Args:
       data: their folders.
       kind: of their episodes.
-      choose: function of the episodes of a data set and its folder that returns those to be used.
+      choose: which episodes of each are used.
+      space: where to put them; None: in memory.
 
     Raises:
       UserError: no folder; one is damaged, holds something else, or cannot be split; or two have scenes in common.
@@ -51,15 +55,33 @@ def load_sides(
     folders = (data,) if isinstance(data, pathlib.Path) else data
     if not folders:
         raise UserError(f"--data: want at least one folder of dipn-datagen {kind}")
-    loaded = [records.load(folder, kind=kind) for folder in folders]
-    slots = max(episodes.scene.shape.shape[1] for episodes, _ in loaded)
-    chosen = [choose(widened(episodes, slots), folder) for (episodes, _), folder in zip(loaded, folders, strict=True)]
-    sides = [split(episodes, folder) for episodes, folder in zip(chosen, folders, strict=True)]
-    learnt, held = sides[0] if len(sides) == 1 else map(structs.concatenate, map(list, zip(*sides, strict=True)))
-    if len(sides) > 1:
+    space = space or Space()
+    loaded, prints = zip(*[records.load(folder, kind=kind, space=space) for folder in folders], strict=True)
+    chosen = [choose(episodes, folder) for episodes, folder in zip(loaded, folders, strict=True)]
+    if len(folders) == 1 and chosen[0] is None:
+        learnt, held = split(loaded[0], folders[0])  # both are views
+        return Sides(learnt, held, (len(learnt.fault),), prints[0])
+    used = [np.arange(len(of.fault)) if rows is None else rows for of, rows in zip(loaded, chosen, strict=True)]
+    cuts = [_cut(of.scene.size[rows], folder) for of, rows, folder in zip(loaded, used, folders, strict=True)]
+    learnt, held = (
+        _gathered([(of, rows[side]) for of, rows, side in zip(loaded, used, sides, strict=True)], space)
+        for sides in zip(*[(slice(0, cut), slice(cut, None)) for cut in cuts], strict=True)
+    )
+    if len(folders) > 1:
         _refuse_overlap(learnt, held)
-    parts = tuple(len(some.scene.shape) for some, _ in sides)
-    return Sides(learnt, held, parts, ":".join(fingerprint for _, fingerprint in loaded))
+    return Sides(learnt, held, tuple(cuts), ":".join(prints))
+
+
+def _gathered(parts: list[tuple[Any, np.ndarray]], space: Space) -> Any:
+    """Return the episodes with these numbers, of one struct after another, all with as many slots as any has."""
+    slots = max(episodes.scene.shape.shape[1] for episodes, _ in parts)
+    made, at = Filled(sum(len(rows) for _, rows in parts), space, what="episodes"), 0
+    for episodes, rows in parts:
+        for begin in range(0, len(rows), _SOME):
+            some = structs.take(episodes, rows[begin : begin + _SOME])
+            made.put(at, widened(some, slots))
+            at += len(some.fault)
+    return made.whole
 
 
 def _refuse_overlap(learnt: Any, held: Any) -> None:
@@ -128,6 +150,10 @@ def split(episodes: Any, data: pathlib.Path) -> tuple[Any, Any]:
     Raises:
       UserError: there are fewer than two scenes.
     """
-    size = np.asarray(episodes.scene.size)
-    cut = held_out.cut([size], len(size), data)
-    return structs.take(episodes, slice(0, cut)), structs.take(episodes, slice(cut, len(size)))
+    cut = _cut(episodes.scene.size, data)
+    return structs.take(episodes, slice(0, cut)), structs.take(episodes, slice(cut, None))
+
+
+def _cut(size: Array, data: pathlib.Path) -> int:
+    """Return how many of the episodes are learnt from, as `split` does; `size [B, N, 3]` are those of their scenes."""
+    return held_out.cut([np.asarray(size)], len(size), data)

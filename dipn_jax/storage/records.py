@@ -8,7 +8,6 @@ import json
 import pathlib
 from typing import Any
 
-import jax
 import numpy as np
 
 from dipn_jax import structs
@@ -16,6 +15,7 @@ from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, manifest, mirror, shards
 from dipn_jax.storage.manifest import MANIFEST
+from dipn_jax.storage.space import Space
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 from dipn_jax.system import files, machine
 
@@ -179,14 +179,15 @@ def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | Se
     return episodes
 
 
-def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
-    """Load a whole data set into memory (a few kilobytes an episode), after checking every shard.
+def load(folder: pathlib.Path, *, kind: str, space: Space | None = None) -> tuple[Any, str]:
+    """Load a whole data set (a few kilobytes an episode), after checking every shard.
 
     Where episodes that were asked for have not been made, one line says so.
 
     Args:
       folder: the data set.
       kind: a key of `layout.KINDS`.
+      space: where to put the episodes; None: in memory.
 
     Returns:
       The episodes `[B, ...]` in the order of the shards, and a fingerprint of the data set.
@@ -195,19 +196,21 @@ def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
       UserError: no such data set, a shard is missing or damaged, or it holds another kind.
     """
     found = checked(folder, kind=kind)
-    return _joined({folder / name: entry["episodes"] for name, entry in found.items()}, kind=kind), fingerprint(found)
+    counts = {folder / name: entry["episodes"] for name, entry in found.items()}
+    return _joined(counts, kind=kind, space=space or Space()), fingerprint(found)
 
 
-def _joined(counts: dict[pathlib.Path, int], *, kind: str) -> Any:
+def _joined(counts: dict[pathlib.Path, int], *, kind: str, space: Space) -> Any:
     """Return the episodes of shards, read on all cores, one after another in the order of the shards.
 
     Args:
       counts: number of episodes of each.
       kind: of the episodes.
+      space: where to put them.
     """
     (path, *_), ends = counts, np.cumsum(list(counts.values()))
     first = shards.read_shard(path, kind=kind)
-    whole = jax.tree.map(lambda leaf: np.empty((ends[-1], *leaf.shape[1:]), leaf.dtype), first)
+    whole = space.arrays(int(ends[-1]), first, what="episodes")
 
     def put(path: pathlib.Path, end: int) -> None:
         shards.read_shard(path, kind=kind, into=structs.take(whole, slice(end - counts[path], end)))

@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import cli, example_store
-from dipn_jax.train.example_store import ExampleStore, Kept, Room
+from dipn_jax.train import cli
+from dipn_jax.train.example_store import ExampleStore, Kept
 from dipn_jax.train.grasp import GraspTask
 from dipn_jax.train.push import PushTask
 
@@ -17,6 +17,7 @@ from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
+from dipn_jax.storage.space import SPARE, Space
 
 
 class Maker:
@@ -56,20 +57,11 @@ def test_each_example_is_made_once_and_the_right_one_is_returned(tmp_path: pathl
 def test_a_disk_that_is_nearly_full_is_one_line(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store, _ = _store(tmp_path / "s")
     _check(store, [1])
-    full = shutil.disk_usage(tmp_path)._replace(free=int(example_store.SPARE))
+    full = shutil.disk_usage(tmp_path)._replace(free=int(SPARE))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
-    with pytest.raises(UserError, match="100 MB are free, too little for more examples; make room"):
+    with pytest.raises(UserError, match="100 MB are free, and more examples need 0 MB and some to spare; make"):
         store.take(np.array([2]))
     _check(store, [1])
-
-
-def test_examples_that_are_made_in_parts_fill_arrays_of_their_size() -> None:
-    made = example_store.Filled(5)
-    for begin in (0, 2, 4):
-        part = np.arange(begin, min(begin + 2, 5))
-        made.put(begin, {"square": part**2, "half": part.astype(np.float16) / 2})
-    np.testing.assert_array_equal(made.whole["square"], np.arange(5) ** 2)
-    assert made.whole["half"].dtype == np.float16 and made.whole["half"].base is None
 
 
 def test_what_was_closed_is_taken_up_and_nothing_else(
@@ -95,7 +87,7 @@ def test_what_was_closed_is_taken_up_and_nothing_else(
 def test_examples_are_in_files_only_if_they_are_large(memory: float, tmp_path: pathlib.Path) -> None:
     maker = Maker()
     everything = lambda: maker(np.resize(np.arange(5000), 5008))  # noqa: E731
-    kept = Kept(maker, everything, 5000, room=Room(memory, tmp_path / "s"), about="squares")
+    kept = Kept(maker, everything, 5000, space=Space(memory, tmp_path / "s"), about="squares")
     np.testing.assert_array_equal(kept.take(np.array([4, 4000]))["square"], [16, 16_000_000])
     kept.close()
     assert (tmp_path / "s").exists() == (memory < 0.001) and (len(set(maker.made)) == 5000) == (memory > 0.001)
@@ -104,12 +96,12 @@ def test_examples_are_in_files_only_if_they_are_large(memory: float, tmp_path: p
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["push", "grasp"])
 def test_tasks_learn_from_the_same_examples(kind: str, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
-    def task(**room: Any) -> Any:
+    def task(**space: Any) -> Any:
         if kind == "push":
-            return PushTask(data["push"], DipnConfig(width=8), limit=None, centimetres=(5, 10), **room)
-        return GraspTask(data["grasp"], GraspConfig(width=8), **room)
+            return PushTask(data["push"], DipnConfig(width=8), limit=None, centimetres=(5, 10), **space)
+        return GraspTask(data["grasp"], GraspConfig(width=8), **space)
 
-    large = task(room=Room(0, tmp_path / "s"))
+    large = task(space=Space(0, tmp_path / "s"))
     index = np.array([3, 0, 17, 3])
     stored, kept = large.fetch(index), task().fetch(index)
     large.close()

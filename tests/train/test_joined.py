@@ -1,10 +1,13 @@
 """Several data sets for one training."""
 
+import mmap
 import pathlib
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
-from dipn_jax.train import cli, loop
+from dipn_jax.train import cli, loop, split
 from dipn_jax.train.configs import DEFAULT_COMPUTE, TrainConfig
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.push import PushTask
@@ -16,6 +19,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import manifest, records, shards
+from dipn_jax.storage.space import Space
 from dipn_jax.system import files
 
 Data = dict[str, pathlib.Path]
@@ -64,6 +68,29 @@ def test_the_last_tenth_of_each_is_held_out(data: Data, wider: Data) -> None:
     half = np.split(sides.held_out.poses, 2)
     np.testing.assert_array_equal(half[0][:, :, :3], half[1][:, :, :3])
     np.testing.assert_array_equal(half[0][:, :, :3], records.load(data["push"], kind="push")[0].poses[20:])
+
+
+def _in_a_file(array: Any) -> bool:
+    """Return whether an array is a view of a file."""
+    return isinstance(array, mmap.mmap) or (hasattr(array, "base") and _in_a_file(array.base))
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_what_memory_has_no_room_for_is_the_same_in_files(
+    several: bool, data: Data, wider: Data, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(split, "_SOME", 7)  # copied in parts
+    folders = (data["push"], wider["push"]) if several else data["push"]
+    half = lambda episodes, folder: np.arange(0, len(episodes.fault), 2) if folder == data["push"] else None  # noqa: E731
+    for choose in (lambda *_: None, half):
+        sides = load_sides(folders, kind="push", choose=choose)
+        mapped = load_sides(folders, kind="push", choose=choose, space=Space(0, tmp_path))
+        assert (mapped.parts, mapped.fingerprint, mapped.slots) == (sides.parts, sides.fingerprint, sides.slots)
+        for one, other in ((sides.learnt, mapped.learnt), (sides.held_out, mapped.held_out)):
+            for leaf, in_file in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+                assert leaf.dtype == in_file.dtype
+                np.testing.assert_array_equal(leaf, in_file)
+        assert _in_a_file(mapped.learnt.poses) and not _in_a_file(sides.learnt.poses)
 
 
 def test_images_of_several_data_sets_are_learnt_from(data: Data, wider: Data) -> None:

@@ -1,0 +1,64 @@
+"""Arrays are in memory as far as it is granted, and in files that nothing is left of beyond."""
+
+import pathlib
+import shutil
+import tempfile
+
+import numpy as np
+import pytest
+
+from dipn_jax.errors import UserError
+from dipn_jax.storage.space import SPARE, Filled, Space
+
+LIKE = {"square": np.zeros((2, 3)), "half": np.zeros(2, np.float16)}
+SIZE = 5 * (3 * 8 + 2)
+
+
+def in_files(arrays: dict[str, np.ndarray]) -> list[bool]:
+    """Return of each array whether it is in a file."""
+    return [isinstance(array, np.memmap) for array in arrays.values()]
+
+
+def test_memory_is_granted_once_and_again_when_it_is_free(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    space = Space(1.5e-9 * SIZE, tmp_path / "not" / "there")
+    first = space.arrays(5, LIKE, what="rows")
+    view = first["square"][1:]
+    assert in_files(first) == [False, False] and not space.fits(SIZE) and not capsys.readouterr().out
+    more = space.arrays(5, LIKE, what="rows")
+    assert in_files(more) == [True, True]
+    assert f"{tmp_path}: 1.3e-07 GB of rows are kept in files there until the command ends" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [], "the files have no names"
+    more["square"][:] = 7
+    assert more["square"].shape == (5, 3) and more["half"].dtype == np.float16 and (more["square"] == 7).all()
+    del first
+    assert not space.fits(SIZE), "a view of some of it is there"
+    del view
+    assert space.fits(1.5 * SIZE) and in_files(space.arrays(5, LIKE, what="rows")) == [False, False]
+    assert Space().fits(1e30), "without a folder there is no limit"
+    assert space.arrays(0, {"none": np.zeros((1, 2))}, what="rows")["none"].shape == (0, 2)
+
+
+def test_a_disk_without_room_is_one_line(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = shutil.disk_usage(tmp_path)._replace(free=int(SPARE) + SIZE - 1)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
+    with pytest.raises(UserError, match="100 MB are free, and rows need 0 MB and some to spare; make room and give"):
+        Space(0, tmp_path).arrays(5, LIKE, what="rows")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full._replace(free=int(SPARE) + SIZE))
+    made, make = [], tempfile.TemporaryFile
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: made.append(dir) or make(dir=dir))  # type: ignore[func-returns-value]
+    assert in_files(Space(0, tmp_path).arrays(5, LIKE, what="rows")) == [True, True]
+    assert made == [tmp_path, tmp_path], "on the disk that has been looked at"
+
+
+@pytest.mark.parametrize("memory", [0.0, 1.0])
+def test_rows_that_are_made_in_parts_fill_arrays_of_their_size(memory: float, tmp_path: pathlib.Path) -> None:
+    made = Filled(5, Space(memory, tmp_path), what="rows")
+    for begin in (0, 2, 4):
+        part = np.arange(begin, min(begin + 2, 5))
+        made.put(begin, {"square": part**2, "half": part.astype(np.float16) / 2})
+    np.testing.assert_array_equal(made.whole["square"], np.arange(5) ** 2)
+    np.testing.assert_array_equal(made.whole["half"], np.arange(5) / 2)
+    assert made.whole["half"].dtype == np.float16 and in_files(made.whole) == [memory == 0] * 2
+    assert memory == 0 or made.whole["half"].base is None
