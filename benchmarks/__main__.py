@@ -67,6 +67,11 @@ BENCHMARKS = {
         "<= 1.03",
         "saving:cost",
     ),
+    "train.from_files": Benchmark(
+        "examples a second of a training whose examples are in files over those in memory",
+        ">= 0.9",
+        "example_files:cost",
+    ),
     "push_net.batched": Benchmark("64 candidate pushes in one call over a call for each", "none", "push_net:batched"),
     "bench_grasp.compact_vs_torch_paper": Benchmark(
         "seconds of all scores of an image, compact GN over the published one in PyTorch",

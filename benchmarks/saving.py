@@ -13,6 +13,7 @@ import numpy as np
 from dipn_jax.train.cli import PUSH
 from dipn_jax.train.loop import make_step
 from dipn_jax.train.optimizers import make_optimizer
+from dipn_jax.train.push import PushTask
 from flax import nnx
 
 from benchmarks.harness import Setting, seconds
@@ -30,7 +31,7 @@ def cost(setting: Setting) -> Iterator[tuple[str, float]]:
     """
     steps, repeats = setting.pick(100, 250), setting.pick(3, 7)
     with tempfile.TemporaryDirectory() as name:
-        training = _Training(name, setting.seed)
+        training = Training(name, small_task(name, "compact", setting.seed), setting.seed)
         training.steps(2, how="none")  # compiles
         times: dict[str, list[float]] = {"none": [], "background": [], "in_line": []}
         for repeat in range(repeats):
@@ -46,11 +47,11 @@ def cost(setting: Setting) -> Iterator[tuple[str, float]]:
     yield "train.saving/milliseconds_a_step", 1000 * medians["none"] / steps
 
 
-class _Training:
-    """A training of the compact DIPN that goes on and on."""
+class Training:
+    """A training of the compact DIPN without an end."""
 
-    def __init__(self, folder: str, seed: int) -> None:
-        self.run, self.task = pathlib.Path(folder) / "run", small_task(folder, "compact", seed)
+    def __init__(self, folder: str, task: PushTask, seed: int) -> None:
+        self.run, self.task = pathlib.Path(folder) / "run", task
         self.model: Any = checkpoint.build("dipn", self.task.network_config, seed=seed)
         parts: Any = nnx.split(self.model, nnx.Param, ...)
         self.graph, self.params, self.rest = parts
