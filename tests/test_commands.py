@@ -240,7 +240,9 @@ def test_commands_without_threads_are_those_that_simulate_nothing() -> None:
     }
 
 
-@pytest.mark.parametrize("platform", ["cuda", "tpu", "bananas"])
+@pytest.mark.parametrize(
+    "platform", ["cuda", *(pytest.param(name, marks=pytest.mark.slow) for name in ("tpu", "bananas"))]
+)
 def test_a_device_that_is_not_there_is_one_line(platform: str, tmp_path: pathlib.Path) -> None:
     """Each command comes to JAX in its own way: its default device, a seed, a network."""
     scripts = [["datagen", "images"], ["train", "grasp-online"], ["eval", "grasp", "--grasp-net", "builtin"]]

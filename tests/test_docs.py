@@ -25,6 +25,8 @@ from experiments import moving_picture, runs, tutorial_pictures
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+SLOW = ("other_tools.md", "your_method.md")
+"""Pages whose Python takes long."""
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -132,7 +134,11 @@ def export_all(page: pathlib.Path) -> None:
             assert console.run(program, importlib.import_module(runs.PROGRAMS[program]).COMMANDS, arguments) == 0
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *HOWTO], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[pytest.mark.slow] * (page.name in SLOW)) for page in (ROOT / "README.md", *HOWTO)],
+    ids=lambda page: page.name,
+)
 def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
     prepare(tmp_path, data)
     with contextlib.chdir(tmp_path):

@@ -114,6 +114,7 @@ def test_policies_of_the_shipped_networks_share_what_is_compiled_unless_their_ai
     assert bare.act is not one.act and bare.rule.draw_all
 
 
+@pytest.mark.slow
 def test_a_policy_is_loaded_by_its_name(settled: Any) -> None:
     """`gn` chooses the best grasp of the shipped network, and so does `dipn+gn` where it does not push."""
     observation = dipn_jax.render(settled.scene[0], settled.poses[0])
@@ -123,6 +124,9 @@ def test_a_policy_is_loaded_by_its_name(settled: Any) -> None:
     np.testing.assert_array_equal(grasping.grasp_pixel, both.grasp_pixel)
     _, row, col = grasping.grasp_pixel
     assert observation.label[row, col] >= 0, "it grasps an object"
+
+
+def test_a_policy_that_cannot_be_loaded_is_one_line() -> None:
     with pytest.raises(dipn_jax.UserError, match=r"--method vpg: needs --value-net \(in Python value_net\)"):
         dipn_jax.load_policy("vpg")
     with pytest.raises(dipn_jax.UserError, match=r"physics.gn: decides on the simulator's state"):

@@ -11,6 +11,8 @@ from dipn_jax.physics import hosted, warp
 from dipn_jax.physics.warp_worlds import Worlds
 from dipn_jax.structs import Fault, Rollout, Scene, Trajectory
 
+pytestmark = pytest.mark.slow  # compiles kernels for most of a minute
+
 FENCE = 0.05
 SAMPLES = np.array([0.0, 0.03, 0.03, 0.13])
 
