@@ -6,12 +6,12 @@ import sys
 
 from dipn_jax.commands import console
 
-from . import merging
 from .clearing import command as clearing
 from .clearing import sweep_command as sweeping
 from .grasping import command as grasping
 from .prediction import command as prediction
 from .report import command as report
+from .workers import merging
 
 COMMANDS = {
     "prediction": prediction.predict,

@@ -12,10 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from dipn_jax.eval import curves, merging, metrics, shares
+from dipn_jax.eval import curves, metrics
 from dipn_jax.eval.clearing import film
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.report import comparison
+from dipn_jax.eval.workers import merging, shares
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError

@@ -11,7 +11,7 @@ from dipn_jax.commands import command_line
 from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.names import ALL_AIDS, Aid, EngineName, MethodName
 
-from ..shares import WHOLE, Share
+from ..workers.shares import WHOLE, Share
 from . import evaluation
 from .camera import DEFAULT_CAMERA, Camera
 from .tables import DEFAULT_TABLES, Tables
@@ -85,7 +85,7 @@ def clear(
     from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.storage import resume
 
-    from .. import spread
+    from ..workers import launching
     from . import on_tables
 
     evaluation.check(out, seed, tables, candidates=candidates, distances=distances, gamma=gamma, threshold=threshold)
@@ -95,7 +95,7 @@ def clear(
     share.check(launch)
     networks, physics = Networks(push_net, grasp_net, value_net), grouped.apart(make_engine(engine, threads=threads))
     if launch.spreads:
-        spread.spread(
+        launching.evaluate(
             "clear", asked, resume.Partial(out, given, inputs=evaluation.inputs(networks.runs(method), tables))
         )
         return

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 
-from .. import options, shares
-from ..shares import WHOLE, Share
+from .. import options
+from ..workers import shares
+from ..workers.shares import WHOLE, Share
 from .camera import Camera
 from .tables import SHIPPED, Tables
 

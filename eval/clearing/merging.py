@@ -9,7 +9,7 @@ from typing import Any
 from dipn_jax.errors import UserError
 from dipn_jax.system import files, typed
 
-from ..shares import Part
+from ..workers.shares import Part
 from . import lockstep
 from .lockstep import EPISODES, Outcome
 

@@ -15,8 +15,9 @@ from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
 from dipn_jax.names import ALL_AIDS, Aid, EngineName
 
-from .. import options, shares
-from ..shares import WHOLE, Share
+from .. import options
+from ..workers import shares
+from ..workers.shares import WHOLE, Share
 from . import evaluation
 from .camera import DEFAULT_CAMERA, Camera
 from .tables import DEFAULT_TABLES, Tables
@@ -81,7 +82,8 @@ def sweep(
     from dipn_jax.planning.policy_config import PolicyConfig
     from dipn_jax.storage import owner, resume
 
-    from .. import metrics, spread
+    from .. import metrics
+    from ..workers import launching
     from . import sweep_merging, sweeping
 
     every = sweeping.parse(distances)
@@ -97,7 +99,7 @@ def sweep(
     inputs = evaluation.inputs(networks.runs("dipn+gn"), tables)
     kept = resume.Partial(out, given, inputs=inputs, part=share.named())
     if launch.spreads:
-        spread.spread("sweep", asked, kept)
+        launching.evaluate("sweep", asked, kept)
         return
     command = command_line.words(sweep, asked, without=command_line.WORKER_OPTIONS)
     with owner.owned(out):

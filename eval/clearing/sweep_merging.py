@@ -16,8 +16,9 @@ from dipn_jax.storage import arrays
 from dipn_jax.storage.arrays import Form
 from dipn_jax.system import files, typed
 
-from .. import drawing, metrics, shares
-from ..shares import PART, Part
+from .. import drawing, metrics
+from ..workers import shares
+from ..workers.shares import PART, Part
 from . import merging, sweeping
 
 ERRORS = "errors.npz"

@@ -26,7 +26,7 @@ from dipn_jax.world import clutter, primitives
 from dipn_jax.world.scenes import SceneConfig
 
 from .. import drawing, metrics
-from ..shares import WHOLE, Share
+from ..workers.shares import WHOLE, Share
 
 CHOSEN = "chosen"
 """Name of the policy that chooses the distance of each push."""

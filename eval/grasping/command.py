@@ -14,9 +14,10 @@ from dipn_jax.errors import UserError
 from dipn_jax.names import ALL_AIDS, Aid, EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
-from .. import options, shares
+from .. import options
 from ..clearing.camera import DEFAULT_CAMERA, Camera
-from ..shares import WHOLE, Share
+from ..workers import shares
+from ..workers.shares import WHOLE, Share
 
 
 def grasp(
@@ -75,8 +76,9 @@ def grasp(
     from dipn_jax.storage import checkpoint, owner, resume
     from dipn_jax.world import scenes
 
-    from .. import curves, drawing, spread
+    from .. import curves, drawing
     from ..clearing import lockstep
+    from ..workers import launching
     from . import merging, success
 
     config, single = (scenes.parse_objects(count, ranges=ranges) for count in (objects, "1"))
@@ -86,7 +88,7 @@ def grasp(
     if run:
         physics, scorer = grouped.apart(make_engine(engine, threads=threads)), scorers.load_scorer(run, aids=aids)
     if launch.spreads:
-        spread.spread("grasp", asked, partial)
+        launching.evaluate("grasp", asked, partial)
         return
     with owner.owned(out):
         if shares.made(out, "grasp", share, partial):

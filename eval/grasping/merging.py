@@ -16,7 +16,7 @@ from .. import curves, drawing
 from ..clearing import merging as clearing
 from ..clearing.instances import Instance
 from ..clearing.lockstep import Outcome
-from ..shares import PART, Part
+from ..workers.shares import PART, Part
 from . import rates
 from .rates import Arrays
 

@@ -26,7 +26,7 @@ from dipn_jax.world.scenes import SceneConfig
 from ..clearing import instances, lockstep, on_tables
 from ..clearing.camera import DEFAULT_CAMERA, Camera
 from ..clearing.instances import Instance
-from ..shares import WHOLE, Share
+from ..workers.shares import WHOLE, Share
 from .rates import Arrays
 
 NO_OTHERS: Arrays = {"missed_table": np.zeros(0, int), "missed_held": np.zeros(0, bool)}

@@ -13,8 +13,9 @@ from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
-from .. import options, shares
-from ..shares import WHOLE, Share
+from .. import options
+from ..workers import shares
+from ..workers.shares import WHOLE, Share
 
 
 def predict(
@@ -66,7 +67,7 @@ def predict(
     from dipn_jax.storage import owner, resume
     from dipn_jax.world import scenes
 
-    from .. import spread
+    from ..workers import launching
     from . import merging, push_errors
 
     config = scenes.parse_objects(objects, ranges=ranges)
@@ -74,7 +75,7 @@ def predict(
     partial = resume.Partial(out, settings, inputs=runs, part=share.named())
     truth = make_engine(engine, threads=threads)
     if launch.spreads:
-        spread.spread("prediction", asked, partial)
+        launching.evaluate("prediction", asked, partial)
         return
     with owner.owned(out):
         if shares.made(out, "prediction", share, partial):

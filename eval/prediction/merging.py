@@ -13,8 +13,9 @@ from dipn_jax.storage import arrays
 from dipn_jax.storage.arrays import Form
 from dipn_jax.system import files, typed
 
-from .. import curves, drawing, shares
-from ..shares import PART, Part
+from .. import curves, drawing
+from ..workers import shares
+from ..workers.shares import PART, Part
 from . import push_errors
 from .push_errors import DISTANCES
 

@@ -23,7 +23,7 @@ from dipn_jax.storage import resume
 from dipn_jax.structs import Observation, Push
 from dipn_jax.world.scenes import SceneConfig
 
-from ..shares import WHOLE, Share
+from ..workers.shares import WHOLE, Share
 from .pushes import DISTANCES, Executed, execute
 
 GROUP = batching.BATCH

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dipn_jax.eval.clearing import sweep_merging, sweeping
-from dipn_jax.eval.shares import WHOLE, Share
+from dipn_jax.eval.workers.shares import WHOLE, Share
 
 from dipn_jax import structs
 from dipn_jax.planning import predictors

@@ -5,7 +5,7 @@ import pathlib
 import numpy as np
 import pytest
 from dipn_jax.eval.grasping import merging, rates
-from dipn_jax.eval.shares import Part
+from dipn_jax.eval.workers.shares import Part
 
 from dipn_jax.errors import UserError
 from dipn_jax.system import files

@@ -13,7 +13,8 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting
 from dipn_jax.system import typed
 
-from . import options, shares
+from .. import options
+from . import shares
 from .shares import Part
 
 
@@ -46,7 +47,7 @@ def together(parts: Sequence[Part], out: pathlib.Path) -> None:
 
 def write(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:
     """Write the evaluation that the parts make to a folder that this process owns, and return the metrics."""
-    from . import metrics
+    from .. import metrics
 
     made_by = accounting.makers([{**vars(part), "versions": {}} for part in parts])
     if said := accounting.mixed(made_by):

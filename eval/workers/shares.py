@@ -16,7 +16,7 @@ from dipn_jax.commands.launch import Launch
 from dipn_jax.errors import UserError
 from dipn_jax.system import files, machine, typed
 
-from . import options
+from .. import options
 
 if TYPE_CHECKING:
     import numpy as np

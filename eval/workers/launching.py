@@ -12,7 +12,8 @@ from dipn_jax.commands import console, launch
 from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.system import files, temporary
 
-from . import merging, options, shares
+from .. import options
+from . import merging, shares
 from .shares import PART, Share
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ PARTS = "parts"
 """Name of the folder with the parts, in that of the evaluation."""
 
 
-def spread(kind: str, asked: Mapping[str, Any], partial: resume.Partial) -> None:
+def evaluate(kind: str, asked: Mapping[str, Any], partial: resume.Partial) -> None:
     """Make the parts of an evaluation that are missing, and put all together.
 
     Args:
@@ -70,7 +71,7 @@ def make_part(kind: str, given: dict[str, Any]) -> None:
       kind: command of dipn-eval.
       given: its options by name, as its function takes them; a dictionary, because each command has its own.
     """
-    from . import cli
+    from .. import cli
 
     target = place(given["out"], given["share"])
     own = temporary.beside(target)

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from dipn_jax.eval import cli, spread
+from dipn_jax.eval import cli
+from dipn_jax.eval.workers import launching
 
 from dipn_jax.commands import console, launch
 from dipn_jax.commands.launch import Launch
@@ -45,7 +46,7 @@ def test_tasks_make_the_evaluation_of_one_worker_and_a_second_start_only_what_is
 ) -> None:
     out, net, ray = tmp_path / "out", tiny["grasp"], ("--launcher", "ray", "--of", "3")
     assert _run(tmp_path / "alone", net) == 0
-    make = spread.make_part
+    make = launching.make_part
 
     def stopped(kind: str, given: dict[str, Any]) -> None:
         if given["share"].shard == 1:
@@ -54,7 +55,7 @@ def test_tasks_make_the_evaluation_of_one_worker_and_a_second_start_only_what_is
         make(kind, given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(spread, "make_part", stopped)
+        patch.setattr(launching, "make_part", stopped)
         assert _run(out, net, *ray) == 130
     assert parts_of_one == [0] and not (out / "metrics.json").exists()
     assert _run(out, net, *ray, "--num-cpus", "2") == 0

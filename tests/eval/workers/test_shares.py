@@ -9,10 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from dipn_jax.eval import cli, merging, shares
+from dipn_jax.eval import cli
 from dipn_jax.eval.clearing import lockstep
 from dipn_jax.eval.prediction import push_errors
-from dipn_jax.eval.shares import Share
+from dipn_jax.eval.workers import merging, shares
+from dipn_jax.eval.workers.shares import Share
 
 from dipn_jax.commands import console
 from dipn_jax.commands.launch import LOCAL, Launch
