@@ -1,5 +1,5 @@
 # make demo   set up, then generate, train, clear tables and write demo/report.html
-# make test   lint, types and the quick tests; make test-slow: those that compile, train or simulate for long
+# make test   lint, types and the quick tests; make test-slow: those that take long
 # make test-pages  every command of the pages in docs at small scale (half an hour)
 # make bench  the figures of docs/benchmarks.md (hours on 2 idle cores)
 # make mutants, fuzz, faults; push-figures, grasp-figures, clear-figures  the counts and figures of pages (hours)
@@ -9,7 +9,7 @@ BIN := .venv/bin
 PYTEST = $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 INSTALL := $(BIN)/pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e
 
-.PHONY: setup demo test test-slow test-pages lint bench mutants fuzz faults push-figures grasp-figures clear-figures help
+.PHONY: setup demo test test-slow test-pages lint bench mutants fuzz faults push-figures grasp-figures clear-figures
 help: ; @sed -n 's/^# make/make/p' Makefile
 
 setup: .venv/.installed

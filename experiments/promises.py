@@ -74,7 +74,7 @@ PROMISES = (
         (
             "tests/train/test_resuming.py::test_an_interrupted_run_ends_as_an_uninterrupted_one",
             "tests/train/test_loop.py::test_learning_online_continues_where_it_was_stopped",
-            "tests/train/test_baseline.py::test_an_interrupted_run_continues_to_the_same_end",
+            "tests/train/online/test_baseline.py::test_an_interrupted_run_continues_to_the_same_end",
         ),
     ),
     Promise(

@@ -14,8 +14,8 @@ import tyro
 from dipn_jax.commands import console
 from dipn_jax.system.addresses import Place
 
-from .acting_commands import baseline, grasp_online, say
 from .configs import DEFAULT_COMPUTE, Compute, Preset, ShapeClass, TrainConfig, check
+from .online.commands import baseline, grasp_online, say
 from .sweep_command import sweep
 
 if TYPE_CHECKING:

@@ -60,19 +60,19 @@ def write(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:
 def _merger(kind: str) -> Callable[[Sequence[Part], pathlib.Path], dict[str, Any]]:
     """Return the function that merges parts of a command of dipn-eval."""
     if kind == "clear":
-        from .clearing import merging as clearing
+        from ..clearing import merging as clearing
 
         return clearing.merge
     if kind == "grasp":
-        from .grasping import merging as grasping
+        from ..grasping import merging as grasping
 
         return grasping.merge
     if kind == "prediction":
-        from .prediction import merging as prediction
+        from ..prediction import merging as prediction
 
         return prediction.merge
     if kind == "sweep":
-        from .clearing import sweep_merging as sweeping
+        from ..clearing import sweep_merging as sweeping
 
         return sweeping.merge
     raise UserError(f"{kind}: parts of no command that is known here; want clear, sweep, grasp or prediction")

@@ -14,7 +14,8 @@ from dipn_jax.eval.clearing import sweeping
 from dipn_jax.eval.clearing.tables import Tables
 from dipn_jax.eval.grasping import success
 from dipn_jax.eval.prediction import push_errors
-from dipn_jax.train import baseline, online
+from dipn_jax.train.online import baseline
+from dipn_jax.train.online import grasping as online
 
 from dipn_jax import seeds
 from dipn_jax.commands import console

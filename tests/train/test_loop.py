@@ -7,9 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import log, online, rounds, split
+from dipn_jax.train import log, split
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_step
+from dipn_jax.train.online import grasping as online
+from dipn_jax.train.online import rounds
 from dipn_jax.train.optimizers import make_optimizer
 from dipn_jax.train.push import PushTask
 from flax import nnx

@@ -4,8 +4,9 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import cli, online
+from dipn_jax.train import cli
 from dipn_jax.train.loop import TrainConfig
+from dipn_jax.train.online import grasping as online
 from flax import nnx
 
 from dipn_jax.commands import console

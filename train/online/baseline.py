@@ -29,12 +29,13 @@ from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.system import files
 from dipn_jax.world.scenes import SceneConfig
 
-from . import acting, finite, tables
+from .. import finite
+from ..configs import BaselineConfig
+from ..grasp import GRASP_MIRRORS, PUSH_MIRRORS, SHIFT_PIXELS, WINDOW_PIXELS, Window, executed, windows
+from ..loop import make_step
+from ..optimizers import constant_adamw
+from . import acting, tables
 from .acting import Look
-from .configs import BaselineConfig
-from .grasp import GRASP_MIRRORS, PUSH_MIRRORS, SHIFT_PIXELS, WINDOW_PIXELS, Window, executed, windows
-from .loop import make_step
-from .optimizers import constant_adamw
 from .rounds import Run
 
 LEARNT_PARTS: dict[str, tuple[str, ...]] = {"vpg": ("push", "grasp"), "rea": ("grasp",), "dqn": ("push",)}

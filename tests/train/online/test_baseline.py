@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dipn_jax.train import acting, baseline, tables
-from dipn_jax.train.acting import Look
 from dipn_jax.train.grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, windows
+from dipn_jax.train.online import acting, baseline, tables
+from dipn_jax.train.online.acting import Look
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError

@@ -26,11 +26,12 @@ from dipn_jax.system import files
 from dipn_jax.world import clutter
 from dipn_jax.world.scenes import SceneConfig
 
-from . import finite, tables
-from .configs import OnlineConfig
-from .grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
-from .loop import make_step
-from .optimizers import constant_adamw
+from .. import finite
+from ..configs import OnlineConfig
+from ..grasp import SHIFT_PIXELS, WINDOW_PIXELS, Window, executed_loss, windows
+from ..loop import make_step
+from ..optimizers import constant_adamw
+from . import tables
 from .rounds import Run
 from .tables import Tables
 

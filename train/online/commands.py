@@ -10,7 +10,7 @@ from dipn_jax.commands import console
 from dipn_jax.names import EngineName
 from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 
-from .configs import LARGEST_BATCH, BaselineConfig, OnlineConfig, check_out
+from ..configs import LARGEST_BATCH, BaselineConfig, OnlineConfig, check_out
 
 GRASP_ONLINE = OnlineConfig()
 """How `grasp-online` learns unless told otherwise."""
@@ -53,7 +53,7 @@ def grasp_online(
     from dipn_jax.storage import checkpoint
     from dipn_jax.world import scenes
 
-    from . import online
+    from . import grasping as online
 
     model: Any
     if init:

@@ -6,7 +6,9 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import baseline, cli, online
+from dipn_jax.train import cli
+from dipn_jax.train.online import baseline
+from dipn_jax.train.online import grasping as online
 from flax import nnx
 
 from dipn_jax.commands import console
