@@ -1,6 +1,9 @@
 """Values of options that would fill all memory, or that mean something else than they seem to: one line each."""
 
+import errno
+import os
 import pathlib
+from typing import Any
 
 import pytest
 from dipn_jax.datagen import cli as datagen_cli
@@ -41,6 +44,44 @@ def test_counts_that_no_memory_holds(stage: str, words: tuple[object, ...], refu
     shown = f"{float(str(value)):.3g}" if option in ("--steps", "--episodes") else value
     refused(stage, (*words, "--out", tmp_path / "o"), says=f"{option} {shown}: want")
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [
+        ("datagen", ("push", "--episodes", 1, "--objects", 1)),
+        ("datagen", ("images", "--episodes", 1, "--objects", 1)),
+        ("datagen", ("export", "DATA", "--format", "npz")),
+        ("train", ("push", "--data", "DATA", "--steps", 1)),
+        ("train", ("grasp-online", "--objects", 1)),
+        ("train", ("baseline", "--method", "rea", "--objects", 1)),
+        ("train", ("export", "--run", "builtin", "--network", "grasp")),
+        ("eval", ("clear", "--method", "gn", "--grasp-net", "builtin", "--cases", "hard", "--names", "01")),
+        ("eval", ("prediction", "--push-net", "builtin", "--scenes", 1, "--objects", 1)),
+        ("eval", ("grasp", "--grasp-net", "builtin", "--scenes", 1, "--objects", 1)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value[0],
+)
+def test_a_folder_on_a_read_only_disk(
+    stage: str,
+    words: tuple[object, ...],
+    refused,
+    data: dict[str, pathlib.Path],
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No folder can be made in it; the disk is imitated, since a superuser may write anywhere."""
+    make = os.mkdir
+
+    def mkdir(path: str | os.PathLike[str], *rest: Any, **how: Any) -> None:
+        if pathlib.Path(path).is_relative_to(tmp_path):
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        make(path, *rest, **how)
+
+    monkeypatch.setattr(os, "mkdir", mkdir)
+    words = tuple(data["push"] if word == "DATA" else word for word in words)
+    refused(stage, (*words, "--out", tmp_path / "o"), says="Read-only file system")
+    assert not list(tmp_path.iterdir())
 
 
 def test_names_that_mean_something_else(refused, tmp_path: pathlib.Path) -> None:

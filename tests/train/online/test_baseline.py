@@ -263,3 +263,11 @@ def test_values_are_learnt_at_the_executed_pixel(engine: Any) -> None:
         values.append(float(loss))
     assert np.mean(values[-5:]) < 0.5 * np.mean(values[:5])
     assert jnp.isfinite(loss)
+
+
+@pytest.mark.slow
+def test_a_loss_that_is_not_finite_ends_a_run_with_one_line(engine: Any, tmp_path: pathlib.Path) -> None:
+    config = baseline.BaselineConfig("rea", actions=8, tables=2, updates=2, batch=2, learning_rate=1e39)
+    with pytest.raises(UserError, match="not finite") as said:
+        baseline.learn(engine, CONFIG, config, tmp_path)
+    assert "\n" not in str(said.value) and not (tmp_path / "checkpoints").exists()
