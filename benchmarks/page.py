@@ -19,15 +19,44 @@ COLUMNS = ("time", "p50_mm", "p90_mm", "grasps_equal", "faults")
 """Columns of its table."""
 
 
+def _goals() -> dict[str, str]:
+    """Return the goals of all benchmarks and stages, by name."""
+    goals = {known: benchmark.goal for known, benchmark in BENCHMARKS.items()}
+    return goals | {known: stage.goal for known, stage in on_gpu.STAGES.items()}
+
+
+def _base(name: str, goals: dict[str, str]) -> str:
+    """Return the benchmark or stage that a figure is of."""
+    return next(known for known in goals if name == known or name.startswith((f"{known}/", f"{known}.")))
+
+
+def _has_goal(name: str, base: str) -> bool:
+    """Return whether a figure is one that its benchmark's goal is about: its own, of a count or of a preset."""
+    last = name.rpartition("/")[2]
+    return name == base or last.isdigit() or last in ("compact", "paper")
+
+
+def headline(figures: Figures) -> str:
+    """Return as a sentence how many of the goals the figures reach, and which they miss."""
+    goals, reached, missed = _goals(), 0, []
+    for name, value in figures.items():
+        base = _base(name, goals)
+        compare, _, bound = goals[base].partition(" ")
+        if _has_goal(name, base) and compare in (">=", "<="):
+            if value >= float(bound) if compare == ">=" else value <= float(bound):
+                reached += 1
+            else:
+                missed.append(f"`{name}` ({value:.3g}, goal {goals[base]})")
+    return f"{reached} of {reached + len(missed)} figures with a goal reach it. Missed: {', '.join(missed) or 'none'}."
+
+
 def tables(figures: Figures) -> str:
     """Return as Markdown ratios with their goals, episodes per second, and the cost of other settings of MJX."""
-    goals = {known: benchmark.goal for known, benchmark in BENCHMARKS.items()}
-    goals |= {known: stage.goal for known, stage in on_gpu.STAGES.items()}
-    ratios = []
+    goals, ratios = _goals(), []
     rates: dict[str, dict[int, float]] = {}
     variants: dict[str, dict[str, float]] = {}
     for name, value in figures.items():
-        base = next(known for known in goals if name == known or name.startswith((f"{known}/", f"{known}.")))
+        base = _base(name, goals)
         if base == SETTINGS:
             _, variant, key = name.split("/")
             variants.setdefault(variant, {})[key] = value
@@ -35,8 +64,7 @@ def tables(figures: Figures) -> str:
             kind, _, count = name.removeprefix("rates.").rpartition("/")
             rates.setdefault(kind.replace("/", ", "), {})[int(count)] = value
         else:
-            plain = name == base or name.rpartition("/")[2].isdigit()
-            ratios.append([f"`{name}`", goals[base] if plain else "", f"{value:.3g}"])
+            ratios.append([f"`{name}`", goals[base] if _has_goal(name, base) else "", f"{value:.3g}"])
     counts = sorted({count for row in rates.values() for count in row})
     speeds = [[kind, *(f"{row[count]:.3g}" if count in row else "" for count in counts)] for kind, row in rates.items()]
     others = [
@@ -82,4 +110,5 @@ def merged(paths: Sequence[pathlib.Path]) -> Figures:
 
 if __name__ == "__main__":
     given = [pathlib.Path(name) for name in sys.argv[1:]]
-    console.say("\n".join([tables(merged(given)), *(origins(files.read_json(path)) for path in given)]))
+    machines = [origins(files.read_json(path)) for path in given]
+    console.say("\n".join([headline(merged(given)), "", tables(merged(given)), *machines]))

@@ -35,6 +35,21 @@ def test_the_page_in_docs_shows_the_figures_in_docs(name: str) -> None:
     for table in page.tables(kept["figures"]).strip().split("\n\n"):
         assert table in text
     assert page.origins(kept) in text
+    assert page.headline(kept["figures"]) in " ".join(text.split())
+
+
+def test_figures_that_miss_their_goals_are_named() -> None:
+    figures = {
+        "render.vs_raycast": 20.0,
+        "train.saving": 1.04,
+        "train.saving/in_line": 9.0,  # has no goal
+        "push_net.vs_torch/paper": 0.5,
+        "push_net.vs_torch/paper_memory": 0.5,
+        "rates.mjx/push/7": 1.0,
+    }
+    said = "1 of 3 figures with a goal reach it. Missed: `train.saving` (1.04, goal <= 1.03), `push_net.vs_torch/paper`"
+    assert page.headline(figures) == f"{said} (0.5, goal >= 1)."
+    assert page.headline({"render.vs_raycast": 20.0}) == "1 of 1 figures with a goal reach it. Missed: none."
 
 
 def test_the_page_of_large_data_sets_shows_the_figures_in_docs() -> None:
