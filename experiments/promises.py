@@ -113,6 +113,14 @@ PROMISES = (
         _fuzz,
     ),
     Promise(
+        "A disk that is full or read-only is one line and exit code 2, and nothing half-written has a final name.",
+        (
+            "tests/test_refused.py::test_a_folder_on_a_read_only_disk",
+            f"{_STORAGE}/test_space.py::test_a_disk_without_room_is_one_line",
+            "tests/experiments/test_faults.py::test_a_command_given_again_after_a_fault_ends_as_an_undisturbed_one",
+        ),
+    ),
+    Promise(
         "The folder of a training or an evaluation has one owner at a time; a second command stops and names it.",
         (
             f"{_STORAGE}/test_owner.py::test_the_second_is_told_who_has_it_and_a_dead_owner_does_not_block",
@@ -174,6 +182,7 @@ PROMISES = (
             "tests/train/test_loop.py::test_a_loss_that_is_not_finite_ends_a_run_at_the_last_finite_checkpoint",
             "tests/train/test_loop.py::test_weights_that_overflow_are_not_saved",
             "tests/train/test_starting.py::test_learning_online_stops_at_a_loss_that_is_not_finite",
+            "tests/train/online/test_baseline.py::test_a_loss_that_is_not_finite_ends_a_run_with_one_line",
         ),
     ),
     Promise(
