@@ -28,18 +28,18 @@ def settings(given: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in given.items() if key not in ("threads", "share", "launch")}
 
 
-def plain(value: Any) -> Any:
+def as_json(value: Any) -> Any:
     """Return an option as JSON can hold it."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
     if isinstance(value, tuple):
-        return [plain(each) for each in value]
+        return [as_json(each) for each in value]
     return str(value) if isinstance(value, pathlib.Path) else value
 
 
 def recorded(settings: dict[str, Any], partial: resume.Partial) -> dict[str, Any]:
     """Return what `settings.json` records: the options, which step of each network was measured, and the sources."""
-    return {key: plain(value) for key, value in settings.items()} | {
+    return {key: as_json(value) for key, value in settings.items()} | {
         "networks": partial.networks,
         "files": partial.files,
         "code": partial.code,

@@ -43,7 +43,7 @@ def imagining(
     return act
 
 
-def comparing(push_scorer: Scorer, scorer: Scorer, plain: Scorer, *, grasp_at_once: bool) -> Act:
+def by_value(push_scorer: Scorer, scorer: Scorer, plain: Scorer, *, grasp_at_once: bool) -> Act:
     """Return the function that compares the best push and the best grasp by value; pushes go the first distance.
 
     Args:

@@ -217,14 +217,14 @@ def _rea_dipn(runs: Runs, config: PolicyConfig) -> Policy:
 def _dqn_gn(runs: Runs, config: PolicyConfig) -> Policy:
     scorer = scorers.load_scorer(runs["grasp"], aids=config.aids)
     plain = scorers.load_plain_scorer(runs["grasp"], table="table" in config.aids)
-    act = acts.comparing(_part(runs["value"], "push"), scorer, plain, grasp_at_once=True)
+    act = acts.by_value(_part(runs["value"], "push"), scorer, plain, grasp_at_once=True)
     return Policy(act, config.rule(), config.spread())
 
 
 def _vpg(runs: Runs, config: PolicyConfig) -> Policy:
     pushes, grasps = _part(runs["value"], "push"), _part(runs["value"], "grasp", config.aids)
     table: tuple[Aid, ...] = ("table",) if "table" in config.aids else ()
-    act = acts.comparing(pushes, grasps, _part(runs["value"], "grasp", table), grasp_at_once=False)
+    act = acts.by_value(pushes, grasps, _part(runs["value"], "grasp", table), grasp_at_once=False)
     return Policy(act, config.rule(), config.spread())
 
 

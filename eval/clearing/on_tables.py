@@ -46,7 +46,7 @@ def load(
         if camera.noisy or camera.masks != "true":
             raise UserError(f"--method {method}: decides on the simulator's state; give --masks true, and no noise")
         scorer, summarize = methods.gn_scores(runs["grasp"], configs[0])
-        decide = functools.partial(rollouts.decide, scorer=scorer, summarize=summarize, engine=engine)
+        decide = functools.partial(rollouts.decide_by_simulation, scorer=scorer, summarize=summarize, engine=engine)
         return [functools.partial(decide, rule=each.rule(), distances=each.spread()) for each in configs]
     policy = methods.build(found, runs, configs[0])
     if not found.pushes:

@@ -18,7 +18,7 @@ from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import primitives, scenes
 
 
-def decide(
+def decide_by_simulation(
     keys: jax.Array,
     scene: Scene,
     poses: Array,

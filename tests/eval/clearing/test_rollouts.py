@@ -58,7 +58,7 @@ def tables(settled: SettledScene) -> SettledScene:
 
 
 def _decide(tables: SettledScene, engine: Records) -> Decision:
-    decision, seen = rollouts.decide(
+    decision, seen = rollouts.decide_by_simulation(
         jax.random.split(jax.random.key(0), 3),
         tables.scene,
         tables.poses,
