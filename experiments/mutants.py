@@ -59,7 +59,7 @@ PAGE = "testing"
 
 
 def section(values: dict[str, Any]) -> str:
-    """Return the page's table of measured modules, and one sentence that names the others, as Markdown.
+    """Return what all modules come to, the table of those measured, and a sentence that names the others, as Markdown.
 
     Args:
       values: module -> its `mutants_session.result`; a module that is missing was not measured.
@@ -70,17 +70,32 @@ def section(values: dict[str, Any]) -> str:
             share = 100 * found["killed"] / max(found["mutants"], 1)
             killed = f"{found['killed']} ({share:.1f} %)"
             rows.append([f"`{module}`", str(found["mutants"]), killed, str(len(found["survivors"]))])
-    text = markdown.table(["module", "mutants", "killed", "survivors"], rows)
+    total, killed = (sum(found[key] for found in values.values()) for key in ("mutants", "killed"))
+    share = 100 * killed / max(total, 1)
+    measured = (
+        f"{len(values)} of {len(TESTS)} modules are measured: {killed} of {total} mutants killed ({share:.1f} %)."
+    )
+    text = f"{measured}\n\n{markdown.table(['module', 'mutants', 'killed', 'survivors'], rows)}"
     if missing := [f"`{module}`" for module in TESTS if module not in values]:
         text += "\n" + textwrap.fill(f"Not measured yet: {', '.join(missing)}.", 120, break_on_hyphens=False) + "\n"
     return text
 
 
+def box(values: dict[str, Any]) -> str:
+    """Return the page's box as Markdown: the commits at which modules were measured; arguments as of `section`."""
+    modules: dict[str, list[str]] = {}
+    for module, found in values.items():
+        modules.setdefault(found["commit"], []).append(module)
+    lines = [f"commit {commit}: {', '.join(named)}" for commit, named in modules.items()]
+    wrapped = [textwrap.fill(line, pages.BOX_WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in lines]
+    return "\n".join(["```", *wrapped, "```"]) + "\n"
+
+
 def write_page(values: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
-    """Write `testing.json`, and its section into `testing.md`."""
+    """Write `testing.json`, and its section and box into `testing.md`."""
     page = docs / f"{PAGE}.md"
     files.write_json(docs / f"{PAGE}.json", values)
-    files.write_text(page, pages.with_tables(files.read_text(page), section(values)))
+    files.write_text(page, pages.with_box(pages.with_tables(files.read_text(page), section(values)), box(values)))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -39,6 +39,7 @@ def test_the_section_in_docs_is_that_of_the_kept_numbers() -> None:
     text, values = (ROOT / "docs" / "testing.md").read_text(), _kept()
     assert set(values) <= set(mutants.TESTS)
     assert pages.with_tables(text, mutants.section(values)) == text
+    assert pages.with_box(text, mutants.box(values)) == text
     for found in values.values():
         assert found["mutants"] == found["killed"] + len(found["survivors"])
 
@@ -72,11 +73,17 @@ def test_a_dry_run_shows_the_tests_of_a_module(tmp_path: pathlib.Path, capsys: p
 
 def test_the_table_has_the_measured_modules_and_a_sentence_the_others() -> None:
     found = {"mutants": 8, "killed": 7, "survivors": [{"became": "x"}]}
-    table, _, others = mutants.section({"train/split.py": found}).partition("\n\n")
+    first, table, others = mutants.section({"train/split.py": found}).split("\n\n")
+    assert first == f"1 of {len(mutants.TESTS)} modules are measured: 7 of 8 mutants killed (87.5 %)."
     assert table.splitlines()[2:] == ["| `train/split.py` | 8 | 7 (87.5 %) | 1 |"]
     assert others.startswith("Not measured yet: `eval/metrics.py`, ") and "train/split.py" not in others
     assert others.count("`") == 2 * (len(mutants.TESTS) - 1) and max(map(len, others.splitlines())) <= 120
     assert "Not measured" not in mutants.section(dict.fromkeys(mutants.TESTS, found))
+
+
+def test_the_box_has_the_commit_of_every_module() -> None:
+    found = {"a.py": {"commit": "1"}, "b.py": {"commit": "2"}, "c.py": {"commit": "1"}}
+    assert mutants.box(found).splitlines() == ["```", "commit 1: a.py, c.py", "commit 2: b.py", "```"]
 
 
 def test_annotations_are_found_and_nothing_else() -> None:
