@@ -166,6 +166,8 @@ def test_the_policy_is_told_of_misses_only_where_it_remembers(
     np.testing.assert_array_equal(ended.film[1]["missed"][0], [0, 0, 0])
     bare = _play([("grasp", ()), ("grasp", (0, 1))], tmp_path, monkeypatch, remember=False)
     assert (bare.film[1]["missed"] == -1).all()
+    later = _play([("push", 0.02), ("grasp", ()), ("push", 0.03), ("grasp", (0, 1))], tmp_path, monkeypatch)
+    assert [int((step["missed"][:, 0] >= 0).sum()) for step in later.film] == [0, 0, 1, 1], "no push is a miss"
 
 
 def test_every_step_of_a_table_is_saved_as_it_was(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
