@@ -18,7 +18,7 @@ import math
 import pathlib
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from dipn_jax.commands import console
@@ -61,7 +61,7 @@ KINDS = {
 """The kinds of faults."""
 POINTS = 200
 """Faults that are tried."""
-NEARER = (1.0, 0.75, 0.5, 0.25)
+NEARER = (0.75, 0.5, 0.25)
 """A fault that is not reached, since another thread makes the call this time, is tried at these parts of the way."""
 COUNTED = ("lost", "repeated", "wrong", "damaged", "tracebacks")
 """What is added up over faults."""
@@ -151,7 +151,7 @@ def _work(options: argparse.Namespace) -> int:
     points = spread(count(cases, out, code), POINTS)[: options.points]
     with console.Progress("faults", len(points), unit="faults") as progress:
         for point in points:
-            _try(point, by_name[point.case], out, code)
+            _try(point, by_name[point.case], out, code, listed=points)
             _write_page(out, code)
             progress.advance(1)
     return 0
@@ -165,19 +165,31 @@ def _write_page(out: pathlib.Path, code: str) -> None:
     reliability.write("faults", found | {pages.MADE: made})
 
 
-def _try(point: Point, case: Case, out: pathlib.Path, code: str) -> None:
-    """Try one fault, unless that has been done with these sources."""
+def nearer(point: Point, taken: Collection[Point]) -> list[Point]:
+    """Return faults that are tried in its place, in turn, if `point` is not reached; those `taken` are none of them."""
+    found: list[Point] = []
+    for part in NEARER:
+        calls = range(math.ceil(part * point.when), 0, -1)
+        free = (dataclasses.replace(point, when=when) for when in calls)
+        found += [next((each for each in free if each not in taken and each not in found), point)]
+    return [each for each in found if each != point]
+
+
+def _try(point: Point, case: Case, out: pathlib.Path, code: str, *, listed: Collection[Point]) -> None:
+    """Try one fault, unless that has been done with these sources; `listed` are all that are to be tried."""
     path = out / "points" / f"{point.case}-{point.kind.replace(' ', '_')}-{point.when:04d}.json"
     if path.exists() and files.read_json(path)["code"] == code:
         return
-    whole = faults_run.reference(case, out)
-    for when in dict.fromkeys(math.ceil(part * point.when) for part in NEARER):
-        nearer = dataclasses.replace(point, when=when)
-        found = faults_run.attempt(nearer, case, KINDS[point.kind], whole, out=out)
+    tried = [files.read_json(each) for each in (out / "points").glob(f"{point.case}-*.json")]
+    taken = {*listed, *(Point(each["case"], each["kind"], each["when"]) for each in tried if each["code"] == code)}
+    whole, sums = faults_run.reference(case, out), dict.fromkeys(COUNTED, 0)
+    for each in (point, *nearer(point, taken)):
+        found = faults_run.attempt(each, case, KINDS[point.kind], whole, out=out)
+        sums = {name: sums[name] + found[name] for name in COUNTED}  # also of those that were not reached
         if found["reached"]:
             break
-    about = {"case": point.case, "kind": point.kind, "when": when, "code": code}
-    files.write_json(path, about | found)
+    about = {"case": point.case, "kind": point.kind, "when": each.when, "code": code}
+    files.write_json(path, about | found | sums)
     if any(found[name] for name in COUNTED):
         console.say(json.dumps(about | {name: found[name] for name in (*COUNTED, "codes")}))
 

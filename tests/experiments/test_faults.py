@@ -43,19 +43,23 @@ def test_a_fault_that_is_not_reached_is_tried_nearer(tmp_path: pathlib.Path, mon
 
     def attempt(point: Point, *_: object, **__: object) -> dict[str, object]:
         tried.append(point.when)
-        return {"reached": int(point.when <= 5), **dict.fromkeys(faults.COUNTED, 0), "codes": [-9, 0]}
+        none = dict.fromkeys(faults.COUNTED, 0)
+        return {"reached": int(point.when <= 5), **none, "wrong": int(point.when == 7), "codes": [-9, 0]}
 
     monkeypatch.setattr(faults_run, "attempt", attempt)
     monkeypatch.setattr(faults_run, "reference", lambda *_: Result([], {}))
     (tmp_path / "points").mkdir()
-    kind = "killed at a write"
-    faults._try(Point("generate", kind, 9), SMALL, tmp_path, "these")
-    faults._try(Point("generate", kind, 9), SMALL, tmp_path, "these")  # it has been tried with these sources
+    kind, listed = "killed at a write", [Point("generate", "killed at a write", when) for when in (9, 10)]
+    faults._try(listed[0], SMALL, tmp_path, "these", listed=listed)
+    faults._try(listed[0], SMALL, tmp_path, "these", listed=listed)  # it has been tried with these sources
     assert tried == [9, 7, 5]
     (kept,) = (tmp_path / "points").iterdir()
-    assert files.read_json(kept)["when"] == 5
-    faults._try(Point("generate", "killed at a sync", 1), SMALL, tmp_path, "these")
-    assert tried == [9, 7, 5, 1]
+    found = files.read_json(kept)
+    assert (found["when"], found["reached"], found["wrong"]) == (5, 1, 1), "what came of others counts, too"
+    faults._try(listed[1], SMALL, tmp_path, "these", listed=listed)
+    assert tried == [9, 7, 5, 10, 8, 4], "5 has been tried"
+    assert faults.nearer(Point("generate", kind, 1), listed) == []
+    assert [each.when for each in faults.nearer(Point("generate", kind, 3), {Point("generate", kind, 3)})] == [2, 1]
 
 
 def test_a_file_that_is_not_whole_is_noticed(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
