@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from benchmarks import on_gpu
@@ -31,13 +31,18 @@ def _base(name: str, goals: dict[str, str]) -> str:
 
 
 def _has_goal(name: str, base: str) -> bool:
-    """Return whether a figure is one that its benchmark's goal is about: its own, of a count or of a preset."""
+    """Return whether a goal of benchmark `base` is about a figure: the only one, that of a count, or of a preset."""
     last = name.rpartition("/")[2]
     return name == base or last.isdigit() or last in ("compact", "paper")
 
 
-def headline(figures: Figures) -> str:
-    """Return as a sentence how many of the goals the figures reach, and which they miss."""
+def headline(figures: Figures, known: Collection[str]) -> str:
+    """Return in sentences how many figures reach their goals, which miss them, and what is not measured.
+
+    Args:
+      figures: value by name.
+      known: names of the benchmarks or stages that could be measured.
+    """
     goals, reached, missed = _goals(), 0, []
     for name, value in figures.items():
         base = _base(name, goals)
@@ -47,7 +52,12 @@ def headline(figures: Figures) -> str:
                 reached += 1
             else:
                 missed.append(f"`{name}` ({value:.3g}, goal {goals[base]})")
-    return f"{reached} of {reached + len(missed)} figures with a goal reach it. Missed: {', '.join(missed) or 'none'}."
+    there = {_base(name, goals) for name in figures}
+    others = [f"`{name}`" for name in known if goals[name] != "none" and name not in there]
+    return (
+        f"{reached} of {reached + len(missed)} figures with a goal reach it. Missed: {', '.join(missed) or 'none'}. "
+        f"Not measured: {', '.join(others) or 'none'}."
+    )
 
 
 def tables(figures: Figures) -> str:
@@ -111,4 +121,4 @@ def merged(paths: Sequence[pathlib.Path]) -> Figures:
 if __name__ == "__main__":
     given = [pathlib.Path(name) for name in sys.argv[1:]]
     machines = [origins(files.read_json(path)) for path in given]
-    console.say("\n".join([headline(merged(given)), "", tables(merged(given)), *machines]))
+    console.say("\n".join([headline(merged(given), BENCHMARKS), "", tables(merged(given)), *machines]))

@@ -113,9 +113,11 @@ PROMISES = (
         _fuzz,
     ),
     Promise(
-        "A disk that is full or read-only is one line and exit code 2, and nothing half-written has a final name.",
+        "A disk that is full or read-only gives one line and exit code 2, and nothing half-written has a final name.",
         (
             "tests/test_refused.py::test_a_folder_on_a_read_only_disk",
+            "tests/test_refused.py::test_a_data_set_on_a_disk_that_became_read_only",
+            f"{_STORAGE}/test_checkpoint.py::test_a_full_disk_is_one_line_and_leaves_no_litter",
             f"{_STORAGE}/test_space.py::test_a_disk_without_room_is_one_line",
             "tests/experiments/test_faults.py::test_a_command_given_again_after_a_fault_ends_as_an_undisturbed_one",
         ),

@@ -84,6 +84,35 @@ def test_a_folder_on_a_read_only_disk(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_data_set_on_a_disk_that_became_read_only(
+    refused, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """More episodes are asked for, but no file can be opened to be written; what is there stays as it is."""
+    folder = tmp_path / "images"
+    words = ("images", "--out", folder, "--objects", 1, "--shard-size", 1, "--engine", "native", "--episodes")
+    assert console.run("test", COMMANDS["datagen"], [*map(str, words), "1"]) == 0
+    capfd.readouterr()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    open_file = os.open
+
+    def opened(path: Any, flags: int, *rest: Any, **how: Any) -> int:
+        if flags & (os.O_CREAT | os.O_WRONLY | os.O_RDWR) and tmp_path in pathlib.Path(path).parents:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        return open_file(path, flags, *rest, **how)
+
+    def written(path: pathlib.Path, mode: str = "r", *rest: Any, **how: Any) -> Any:
+        if set(mode) & set("wax+") and tmp_path in path.parents:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        return open_path(path, mode, *rest, **how)
+
+    open_path = pathlib.Path.open
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", opened)
+        patch.setattr(pathlib.Path, "open", written)
+        refused("datagen", (*words, 2), says="Read-only file system")
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
 def test_names_that_mean_something_else(refused, tmp_path: pathlib.Path) -> None:
     """A step's folder is no run, and what comes with the package is no folder here; a case is not counted twice."""
     step = tmp_path / "run" / "checkpoints" / "00000004"

@@ -54,7 +54,7 @@ class Kept:
 
     def _begin(self) -> None:
         folder = self._space.folder
-        if folder is not None and not self._space.fits(self._size()):
+        if folder is not None and (self._space.examples_in_files or not self._space.fits(self._size())):
             self._store = ExampleStore(folder, self._make, self._count, about=self._about)
         else:
             self._all = self._make_all()

@@ -23,15 +23,18 @@ SPARE = 100e6
 class Space:
     """Memory and a disk for arrays; what is granted is shared by all that is put there."""
 
-    def __init__(self, memory: float = math.inf, folder: pathlib.Path | None = None) -> None:
+    def __init__(
+        self, memory: float = math.inf, folder: pathlib.Path | None = None, *, examples_in_files: bool = False
+    ) -> None:
         """Grant memory.
 
         Args:
           memory: GB that all arrays may take in memory.
           folder: what does not fit is put in files on the disk of this folder, which need not exist; None: everything
             is put in memory.
+          examples_in_files: keep examples in files in the folder, even if they fit, and make each when it is used.
         """
-        self.folder = folder
+        self.folder, self.examples_in_files = folder, examples_in_files
         self._memory = 1e9 * memory
         self._taken = 0
 
@@ -40,7 +43,7 @@ class Space:
         return self.folder is None or self._taken + size <= self._memory
 
     def arrays(self, count: int, like: Any, *, what: str) -> Any:
-        """Return uninitialized arrays `[count, ...]`; those in files lose these when nothing refers to them any more.
+        """Return uninitialized arrays `[count, ...]`; files are deleted when their arrays are not used any more.
 
         Args:
           count: length of their first axis.
@@ -57,7 +60,7 @@ class Space:
         assert self.folder is not None
         disk = next(place for place in (self.folder, *self.folder.parents) if place.is_dir())
         require_room(disk, size, what=what)
-        console.say(f"{disk}: {size / 1e9:.2g} GB of {what} are kept in files there until the command ends")
+        console.say(f"{disk}: {_shown(size)} of {what} are kept in temporary files there")
         return jax.tree.map(lambda leaf: _in_a_file(disk, leaf), shapes)
 
     def _in_memory(self, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
@@ -101,9 +104,14 @@ def require_room(folder: pathlib.Path, size: float, *, what: str) -> None:
     free = shutil.disk_usage(folder).free
     if free < size + SPARE:
         raise UserError(
-            f"{folder}: {free / 1e6:.0f} MB are free, and {what} need {size / 1e6:.0f} MB and some to spare; make room "
-            "and give the same command again, or give a larger --memory"
+            f"{folder}: {_shown(free)} are free, and {what} need {_shown(size)} and some to spare; make room and give "
+            "the same command again, or give a larger --memory"
         )
+
+
+def _shown(size: float) -> str:
+    """Return a number of bytes as people read it."""
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 
 
 def _in_a_file(folder: pathlib.Path, leaf: jax.ShapeDtypeStruct) -> np.ndarray:

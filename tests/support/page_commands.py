@@ -39,6 +39,13 @@ ALWAYS = {
     ("dipn-eval", "grasp"): ("--scenes", "2"),
 }  # fmt: skip
 """Options that the tests add to a command which does not have them."""
+STAND_INS = {
+    "data/push": "push", "data/grasp": "grasp", "data/images": "images", "data/million": "push", "disk1/push": "push",
+    "bucket/million": "push", "runs/dipn": "dipn", "runs/gn": "gn", "results/push/runs/51000-0": "dipn",
+    "results/grasp/shipped": "gn", "disk2/push": ("dipn-datagen", "push", "--seed", "1"),
+    "runs/vpg": ("dipn-train", "baseline", "--method", "vpg"),
+}  # fmt: skip
+"""What pages expect to be there, and what stands for it: a small data set, a shipped network, or a command's result."""
 READ = ("--data", "--run", "--init", "--push-net", "--grasp-net", "--value-net", "--clear", "--prediction", "--grasp")
 """Options that name what a command reads."""
 READERS = ("info", "verify", "repair", "replay", "export", "merge")
@@ -102,27 +109,25 @@ def is_read(words: list[str]) -> list[str]:
 
 
 def stand_in(place: str, data: dict[str, pathlib.Path]) -> list[str] | None:
-    """Put what a page expects to be there in its place: a data set or a shipped network.
+    """Put what a page expects to be there in its place, if it is not there.
 
     Args:
       place: what a command reads.
       data: a small data set of each kind.
 
     Returns:
-      The command that makes it, where neither is what it has to be.
+      The command that makes it, where there is nothing to copy.
     """
     folder = pathlib.Path(place.partition("://")[2] or re.sub("@.*", "", place))
     if folder.exists():
         return None
-    if folder.parts[0] in ("runs", "results"):
-        if folder.name in ("vpg", "rea", "dqn"):
-            return ["dipn-train", "baseline", "--method", folder.name, "--out", str(folder)]
-        network = "grasp" if "gn" in folder.name or "grasp" in folder.parts else "dipn"
-        shutil.copytree(SHIPPED / network, folder)
-        return None
-    if folder.parts[0] == "disk2":
-        return ["dipn-datagen", "push", "--seed", "1", "--out", str(folder)]
-    shutil.copytree(data[folder.name if folder.name in data else "push"], folder)
+    name = str(folder.relative_to(pathlib.Path.cwd()) if folder.is_absolute() else folder)
+    assert name in STAND_INS, f"{name}: neither made by the page nor expected by it to be there"
+    stands = STAND_INS[name]
+    if isinstance(stands, tuple):
+        return [*stands, "--out", str(folder)]
+    sources = {**data, "dipn": SHIPPED / "dipn", "gn": SHIPPED / "grasp"}
+    shutil.copytree(sources[stands], folder)
     return None
 
 

@@ -59,7 +59,7 @@ def test_a_disk_that_is_nearly_full_is_one_line(tmp_path: pathlib.Path, monkeypa
     _check(store, [1])
     full = shutil.disk_usage(tmp_path)._replace(free=int(SPARE))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
-    with pytest.raises(UserError, match="100 MB are free, and more examples need 0 MB and some to spare; make"):
+    with pytest.raises(UserError, match=r"100\.0 MB are free, and more examples need 0\.0 MB and some to spare; make"):
         store.take(np.array([2]))
     _check(store, [1])
 
@@ -112,17 +112,23 @@ def test_tasks_learn_from_the_same_examples(kind: str, data: dict[str, pathlib.P
 
 
 def test_the_command_keeps_them_beside_the_run_and_closes_them(
-    data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    data: dict[str, pathlib.Path],
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def fit(task: Any, *_: Any, **__: Any) -> None:
         task.fetch(np.array([1]))
 
     monkeypatch.setattr(cli, "_fit", fit)
-    for extra, wanted in ((), False), (("--memory", "0"), True), (("--memory", "0", "--compile-only"), False):
+    for extra, wanted in ((), False), (("--memory", "0"), True), (("--compile-only",), False):
         out = tmp_path / "-".join(("run", *extra))
         words = ["grasp", "--data", str(data["grasp"]), "--out", str(out), *extra]
         assert console.run("test", cli.COMMANDS, words) == 0
         assert (out / "examples" / "0" / "whole.json").exists() == wanted
+        said = capsys.readouterr().out
+        assert ("of episodes are kept" in said) == ("--memory" in extra)
+        assert ("of examples are kept" in said) == bool(extra), "only one is made where nothing but a step is compiled"
     monkeypatch.setattr(jax, "process_index", lambda: 3)  # as where a job manager has started several
     words = ["grasp", "--data", str(data["grasp"]), "--out", str(tmp_path / "several"), "--memory", "0"]
     assert console.run("test", cli.COMMANDS, words) == 0
