@@ -72,6 +72,11 @@ BENCHMARKS = {
         ">= 0.9",
         "example_files:cost",
     ),
+    "train.first_step": Benchmark(
+        "seconds and megabytes of a training of one step on many pushes, which fit in memory or are kept in files",
+        "none",
+        "first_step:cost",
+    ),
     "push_net.batched": Benchmark("64 candidate pushes in one call over a call for each", "none", "push_net:batched"),
     "bench_grasp.compact_vs_torch_paper": Benchmark(
         "seconds of all scores of an image, compact GN over the published one in PyTorch",
