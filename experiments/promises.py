@@ -145,7 +145,8 @@ PROMISES = (
         "those of one machine, byte for byte. (The tests are skipped where Ray is not installed.)",
         (
             "tests/datagen/test_spread.py::test_nodes_and_workers_that_are_lost_change_nothing",
-            "tests/eval/workers/test_launching.py::test_a_cluster_that_loses_workers_makes_the_evaluation_of_one_machine",
+            "tests/datagen/test_spread.py::test_a_driver_that_is_killed_goes_on_when_it_is_started_again",
+            "tests/eval/workers/test_launching.py::test_a_cluster_that_loses_a_node_and_workers_makes_the_evaluation_of_one_machine",
         ),
     ),
     Promise(

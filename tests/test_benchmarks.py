@@ -66,6 +66,15 @@ def test_the_page_of_large_data_sets_shows_the_figures_in_docs() -> None:
     at = " ".join(text.split())
     assert f"write {round(written, -4):,.0f} pushes" in at and f"reads {round(read, -4):,.0f} a second" in at
     assert f"a million in {1e6 / read:.0f} s" in at
+    gpu = json.loads((DOCS / "benchmarks-h200.json").read_text())
+    cores = gpu["machine"]["cores"]
+    most = {
+        engine: max(value for name, value in gpu["figures"].items() if f"scene_seconds/{engine}/" in name)
+        for engine in ("mjx", "native")
+    }
+    worth = most["mjx"] / (most["native"] / cores)
+    assert f"as much as {worth:.1f} cores of its host" in at
+    assert f"one such GPU {hours / worth:.1f} h, and the host's {cores} cores {hours / cores:.1f} h" in at
     assert f"takes its driver {kept['figures']['jobs.overhead/launch_milliseconds']:.2g} ms" in text
 
 

@@ -2,7 +2,12 @@
 
 import dataclasses
 import importlib.util
+import os
 import pathlib
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -96,3 +101,24 @@ def test_nodes_and_workers_that_are_lost_change_nothing(
         (out / "shard-00001.parquet").write_bytes(b"")
         assert console.run("test", cli.COMMANDS, words) == 2
         assert "shard-00001.parquet" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install '.[ray]'")
+def test_a_driver_that_is_killed_goes_on_when_it_is_started_again(alone: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    """The process that hands out the tasks is killed as soon as it has a shard; the next makes only what is missing."""
+    import ray_cluster
+
+    out = tmp_path / "out"
+    words = [*WORDS, "--out", str(out), "--launcher", "ray"]
+    with ray_cluster.of_nodes(2) as cluster:
+        environment = os.environ | {"RAY_ADDRESS": cluster.address}
+        driver = subprocess.Popen([sys.executable, "-m", "dipn_jax.datagen.cli", *words], env=environment)
+        while not (there := list(out.glob("*.parquet"))) and driver.poll() is None:
+            time.sleep(0.05)
+        driver.kill()
+        assert driver.wait() == -signal.SIGKILL, "it was killed before it had ended"
+        assert 0 < len(there) < 6 and not (out / "manifest.json").exists()
+        kept = {path: path.stat().st_mtime_ns for path in there}
+        assert console.run("test", cli.COMMANDS, words) == 0
+    assert _bytes(out) == _bytes(alone) and {path: path.stat().st_mtime_ns for path in kept} == kept

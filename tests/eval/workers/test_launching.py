@@ -84,10 +84,10 @@ def test_a_mistake_of_the_users_in_a_task_is_one_line(
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install '.[ray]'")
-def test_a_cluster_that_loses_workers_makes_the_evaluation_of_one_machine(
+def test_a_cluster_that_loses_a_node_and_workers_makes_the_evaluation_of_one_machine(
     tiny: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Workers are killed when the first part is there."""
+    """A node is removed and workers are killed when the first part is there."""
     import ray_cluster
 
     run, lost = launch.run, []
@@ -95,11 +95,12 @@ def test_a_cluster_that_loses_workers_makes_the_evaluation_of_one_machine(
     def losing(*args: Any, **named: Any) -> Iterator[tuple[int, Any]]:
         for one in run(*args, **named):
             if not lost:
+                cluster.remove_node(cluster.nodes.pop(), allow_graceful=False)
                 lost.append(ray_cluster.kill_workers(cluster))
             yield one
 
     assert _run(tmp_path / "alone", tiny["grasp"]) == 0
-    with ray_cluster.of_nodes(2) as cluster:
+    with ray_cluster.of_nodes(3) as cluster:
         monkeypatch.setattr(launch, "run", losing)
         assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray", "--of", "3") == 0
     assert lost and lost[0] >= 1
