@@ -16,6 +16,7 @@ from dipn_jax.train import cli as train
 
 from dipn_jax.commands import console, launch
 from dipn_jax.commands.launch import Launch
+from dipn_jax.storage import checkpoint
 from dipn_jax.storage.objects import Bucket
 
 WORDS = ("images", "--objects", "1", "--episodes", "6", "--shard-size", "1", "--engine", "native")
@@ -109,6 +110,24 @@ def test_the_commands_read_it(
 def test_a_training_reads_it(data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
     (copy, same) = train._local((pathlib.Path(f"file://{data['push']}"), data["push"]))
     assert same == data["push"] and copy != same and _bytes(copy) == _bytes(same)
+
+
+@pytest.mark.slow
+def test_a_training_on_a_bucket_is_that_on_a_folder(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import s3_server
+
+    with s3_server.running(monkeypatch):
+        for path in data["grasp"].iterdir():
+            s3_server.client().put_object(Bucket="bucket", Key=f"grasp/{path.name}", Body=path.read_bytes())
+        digests = []
+        for name, place in (("folder", str(data["grasp"])), ("bucket", "s3://bucket/grasp")):
+            out = tmp_path / name
+            words = ["grasp", "--data", place, "--out", str(out), "--steps", "2", "--batch", "2"]
+            assert console.run("test", train.COMMANDS, words) == 0
+            digests.append(checkpoint.digest(checkpoint.load_network(out, network="grasp")))
+    assert digests[0] == digests[1]
 
 
 def test_what_cannot_be_there_is_refused_in_one_line(
