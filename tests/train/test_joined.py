@@ -20,6 +20,7 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import manifest, records, shards
 from dipn_jax.storage.space import Space
+from dipn_jax.structs import ABSENT
 from dipn_jax.system import files
 
 Data = dict[str, pathlib.Path]
@@ -67,6 +68,8 @@ def test_the_last_tenth_of_each_is_held_out(data: Data, wider: Data) -> None:
     sides = load_sides((data["push"], wider["push"]), kind="push")
     half = np.split(sides.held_out.poses, 2)
     np.testing.assert_array_equal(half[0][:, :, :3], half[1][:, :, :3])
+    absent = sides.learnt.scene.shape == ABSENT
+    assert absent[:20, 3:].all() and not sides.learnt.scene.size[absent].any(), "slots that are added are empty"
     np.testing.assert_array_equal(half[0][:, :, :3], records.load(data["push"], kind="push")[0].poses[20:])
 
 
@@ -91,6 +94,8 @@ def test_what_memory_has_no_room_for_is_the_same_in_files(
                 assert leaf.dtype == in_file.dtype
                 np.testing.assert_array_equal(leaf, in_file)
         assert _in_a_file(mapped.learnt.poses) and not _in_a_file(sides.learnt.poses)
+        copied = several or choose is half
+        assert (sides.learnt.poses.base is None) == copied, "a whole data set is not copied"
 
 
 def test_images_of_several_data_sets_are_learnt_from(data: Data, wider: Data) -> None:

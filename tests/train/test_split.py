@@ -4,7 +4,7 @@ import pathlib
 
 import numpy as np
 import pytest
-from dipn_jax.train.split import split
+from dipn_jax.train.split import first, split
 
 from dipn_jax.errors import UserError
 from dipn_jax.structs import Scene, SettledScene
@@ -44,3 +44,13 @@ def test_the_cut_is_where_the_nearest_scene_begins() -> None:
 def test_one_scene_cannot_be_split() -> None:
     with pytest.raises(UserError, match="data set data: 7 examples of one scene"):
         split(_examples(7), pathlib.Path("data"))
+
+
+def test_a_limit_keeps_the_first_ones() -> None:
+    examples = _examples(2, 3)
+    for limit in (1, 5, None):
+        kept = first(examples, limit, what="images")
+        np.testing.assert_array_equal(kept.poses, examples.poses[:limit])
+    for limit in (0, 6):
+        with pytest.raises(UserError, match=f"--limit {limit}: want 1 to 5, the images of --data"):
+            first(examples, limit, what="images")

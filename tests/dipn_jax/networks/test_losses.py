@@ -66,5 +66,12 @@ def test_moved_is_over_3_mm_or_3_degrees() -> None:
     assert got.tolist() == [[False, True, True, True, True], [False, True, True, False, False]]
 
 
+def test_what_is_exactly_at_the_limit_has_not_moved() -> None:
+    at = np.zeros((2, 3), np.float32)
+    at[0, 0], at[1, 2] = losses.MOVED_DISTANCE, losses.MOVED_ANGLE
+    assert float(jnp.linalg.norm(at[0, :2])) == np.float32(losses.MOVED_DISTANCE), "no rounding decides"
+    assert not losses.moved(jnp.array(at)).any()
+
+
 def test_a_small_turn_is_no_distance() -> None:
     assert not losses.moved(jnp.array([0.002, 0.0, 0.05]))

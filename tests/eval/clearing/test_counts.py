@@ -60,3 +60,15 @@ def test_a_table_is_cleared_before_its_actions_count() -> None:
         assert lockstep._ended(_table([ABSENT, ABSENT], here, actions=actions)) == "cleared"
     wanted = {0: "", 5: "", 6: "out of actions", 7: "out of actions"}
     assert {n: lockstep._ended(_table([0, ABSENT], here, actions=n)) for n in wanted} == wanted
+
+
+def test_misses_are_forgotten_where_the_table_has_changed() -> None:
+    before = np.zeros((WORKSPACE.pixels, WORKSPACE.pixels), np.float32)
+    after = before.copy()
+    after[90:130, 90:130] = 0.05
+    tables = [_table([0, 0], [(0, 0, 0)] * 2) for _ in range(2)]
+    for table in tables:
+        table.missed = table.missed.add(np.array([3, 110, 110]), before)
+    found = lockstep._recall(tables, np.stack([before, after]))
+    np.testing.assert_array_equal(found[0, 0], [3, 110, 110])
+    assert (found[1] == -1).all() and (found[0, 1:] == -1).all()
