@@ -17,19 +17,22 @@ from dipn_jax.eval.clearing import film
 from dipn_jax.eval.clearing.instances import Instance
 from dipn_jax.eval.report import comparison
 from dipn_jax.eval.workers import merging, shares
+from dipn_jax.train import loop
+from dipn_jax.train.configs import TrainConfig
+from dipn_jax.train.example_store import ExampleStore
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
-from dipn_jax.storage import accounting, checkpoint, records, resume, shards
+from dipn_jax.storage import checkpoint, records, resume, shards
 from dipn_jax.storage.manifest import MANIFEST, update_manifest
-from dipn_jax.structs import Grasp, GraspEpisode, Push, PushEpisode, Scene, SettledScene
 from dipn_jax.system import files
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import cases
 from experiments import fuzzing, runs
+from experiments.fuzz_data import CONFIG, data_set, episodes
 
-CONFIG = {"kind": "push", "episodes": 6, "shard_size": 2, "seed": 0, "distances": [0.1], "weights": ""}
-"""The configuration of a data set."""
+TRAINING = TrainConfig(steps=10, batch=2, eval_every=5, save_every=5)
+"""The configuration of a training."""
 FRESH = object()
 """A state that stands for none."""
 
@@ -43,40 +46,6 @@ class Parser:
     prepare: Callable[[pathlib.Path], None]  # writes the file, and what has to be beside it
     read: Callable[[pathlib.Path], Any]  # of the folder
     mutate: fuzzing.Mutate
-
-
-def episodes(kind: str, *, count: int = 2, slots: int = 3) -> Any:
-    """Return episodes of a kind, of objects that do not move."""
-    rng = np.random.default_rng(0)
-
-    def numbers(*shape: int) -> np.ndarray:
-        return rng.uniform(0.01, 0.1, (count, *shape)).astype(np.float32)
-
-    scene = Scene(
-        rng.integers(0, 5, (count, slots), np.int32),
-        numbers(slots, 3),
-        numbers(slots, 3),
-        numbers(slots),
-        numbers(slots),
-    )
-    poses, fault = numbers(slots, 7), np.zeros(count, np.int32)
-    if kind == "images":
-        return SettledScene(scene, poses, fault)
-    if kind == "grasp":
-        held = rng.random((count, slots)) < 0.5
-        return GraspEpisode(scene, poses, poses, Grasp(numbers(2), numbers(), numbers()), held, np.any(held, -1), fault)
-    return PushEpisode(scene, np.repeat(poses[:, None], 11, 1), poses, Push(numbers(2), numbers(), numbers()), fault)
-
-
-def data_set(folder: pathlib.Path, *, kind: str = "push", number: int = 2) -> None:
-    """Write a data set of `number` shards with two episodes each, of which one shard more was asked for."""
-    folder.mkdir(parents=True, exist_ok=True)
-    config = {**CONFIG, "kind": kind, "episodes": 2 * number + 2}
-    for index in range(number):
-        shards.write_shard(folder, index, episodes(kind), kind=kind, config=config, faults={"dropped_scenes": 1})
-    files.write_json(folder / "config.json", config)
-    accounting.note(folder, [kind, "--episodes", "6"], of=3)
-    update_manifest(folder)
 
 
 def _look_at_data(folder: pathlib.Path) -> None:
@@ -226,6 +195,7 @@ def _parsers() -> list[Parser]:
         Parser("command kept", "asked.json", data_set, _missing, tree),
         Parser("manifest", "manifest.json", data_set, _look_at_data, tree),
         Parser("shard", "shard-00000.parquet", _one_shard, _look_at_shard, table),
+        Parser("grasps", "shard-00000.parquet", functools.partial(_one_shard, kind="grasp"), _look_at_grasps, table),
         Parser("repair", "shard-00000.parquet", _one_shard, _repair, table),
         Parser("checkpoint", f"checkpoints/{step.name}/meta.json", _network, _load_network, tree),
         Parser("state", "partial.npz", _save_state, _load_state, fuzzing.mutate_arrays),
@@ -235,6 +205,8 @@ def _parsers() -> list[Parser]:
         Parser("settings", "settings.json", _save_cleared, _report, tree),
         Parser("metrics", "metrics.json", _save_cleared, _report, tree),
         Parser("log", "metrics.jsonl", _log, lambda at: curves.load_grasp_runs([at]), lines),
+        Parser("training", "config.json", _begin_training, _go_on_training, tree),
+        Parser("examples", "whole.json", _keep_examples, _keep_examples, tree),
         Parser("stamp", runs.STAMP, _stamp, lambda at: runs.is_complete(_run(at), "key"), tree),
     ]
 
@@ -258,14 +230,35 @@ def _missing(folder: pathlib.Path) -> None:
     assert said and "\n" not in said
 
 
-def _one_shard(folder: pathlib.Path) -> None:
-    data_set(folder, number=1)
+def _one_shard(folder: pathlib.Path, kind: str = "push") -> None:
+    data_set(folder, kind=kind, number=1)
 
 
-def _look_at_shard(folder: pathlib.Path) -> None:
+def _look_at_grasps(folder: pathlib.Path) -> None:
+    _look_at_shard(folder, kind="grasp")
+
+
+def _begin_training(folder: pathlib.Path) -> None:
+    """Write the configuration of a training."""
+    loop._claim(folder, dataclasses.asdict(TRAINING), TRAINING)
+
+
+def _go_on_training(folder: pathlib.Path) -> None:
+    """Read the configuration as the command does that goes on with the training."""
+    loop._claim(folder, dataclasses.asdict(TRAINING), TRAINING, write=False)
+
+
+def _keep_examples(folder: pathlib.Path) -> None:
+    """Take up examples that are kept in files, or make them anew, and close them."""
+    kept = ExampleStore(folder, lambda rows: {"x": np.asarray(rows, np.float32)}, 3, about="numbers")
+    assert kept.take(np.arange(3))["x"].tolist() == [0, 1, 2]
+    kept.close()
+
+
+def _look_at_shard(folder: pathlib.Path, kind: str = "push") -> None:
     """Read a shard, and list it in a manifest."""
     (folder / MANIFEST).unlink(missing_ok=True)
-    shards.read_shard(folder / "shard-00000.parquet", kind="push")
+    shards.read_shard(folder / "shard-00000.parquet", kind=kind)
     update_manifest(folder)
     records.summary(folder)
 
