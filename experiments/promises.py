@@ -146,7 +146,7 @@ PROMISES = (
         (
             "tests/datagen/test_spread.py::test_nodes_and_workers_that_are_lost_change_nothing",
             "tests/datagen/test_spread.py::test_a_driver_that_is_killed_goes_on_when_it_is_started_again",
-            "tests/eval/workers/test_launching.py::test_a_cluster_that_loses_a_node_and_workers_makes_the_evaluation_of_one_machine",
+            "tests/eval/workers/test_launching.py::test_a_cluster_that_loses_nodes_makes_the_evaluation_of_one_machine",
         ),
     ),
     Promise(

@@ -99,23 +99,25 @@ def damage(run: pathlib.Path, ways: Sequence[str] = tuple(WAYS)) -> dict[str, in
       ways: keys of WAYS.
 
     Returns:
-      `damaged`, how often that was done, and `recovered`, how often the step before was loaded instead.
+      `damaged`, how often that was done, and `recovered`, how often the step before was loaded instead, by an
+      evaluation and by a training that goes on.
     """
     from dipn_jax.storage import checkpoint
 
     newest, before = sorted((run / "checkpoints").iterdir(), reverse=True)
     kept = run / "kept"
     shutil.copytree(newest, kept)
-    wanted = checkpoint.digest(checkpoint.load_network(before, network="grasp"))
+    wanted = checkpoint.digest(checkpoint.load_network(before, network="grasp")), before
     count = {"damaged": 0, "recovered": 0}
     for path in sorted(path for path in newest.rglob("*") if path.is_file()):
         for way in ways:
             WAYS[way](path)
             count["damaged"] += 1
             try:
-                found = checkpoint.digest(checkpoint.load_network(run, network="grasp"))
+                resumed = checkpoint.newest(run)
+                found = checkpoint.digest(checkpoint.load_network(run, network="grasp")), resumed and resumed[0]
             except UserError:
-                found = ""
+                found = "", None
             count["recovered"] += found == wanted
             shutil.copy(kept / path.relative_to(newest), path)
     shutil.rmtree(kept)
@@ -123,7 +125,9 @@ def damage(run: pathlib.Path, ways: Sequence[str] = tuple(WAYS)) -> dict[str, in
 
 
 def two_steps(run: pathlib.Path) -> None:
-    """Write a run of a small GN with two steps."""
+    """Write a run of a small GN with two steps, each with the state of its optimizer."""
+    from dipn_jax.train.configs import TrainConfig
+    from dipn_jax.train.optimizers import make_optimizer
     from flax import nnx
 
     from dipn_jax.networks.grasp import GraspConfig
@@ -131,7 +135,9 @@ def two_steps(run: pathlib.Path) -> None:
 
     config = GraspConfig(width=8, coarse=8, blocks=1)
     for step in (1, 2):
-        parts = {"model": nnx.state(checkpoint.build("grasp", config, seed=step))}
+        model = checkpoint.build("grasp", config, seed=step)
+        moments = make_optimizer(TrainConfig(steps=2)).init(nnx.state(model, nnx.Param))
+        parts = {"model": nnx.state(model), "train": moments}
         checkpoint.save(run, step, parts, network="grasp", config=config, extra={})
 
 

@@ -84,7 +84,7 @@ def test_a_mistake_of_the_users_in_a_task_is_one_line(
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install '.[ray]'")
-def test_a_cluster_that_loses_a_node_and_workers_makes_the_evaluation_of_one_machine(
+def test_a_cluster_that_loses_nodes_makes_the_evaluation_of_one_machine(
     tiny: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A node is removed and workers are killed when the first part is there."""
