@@ -88,7 +88,13 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 @pytest.mark.parametrize(
     ("kind", "when"),
-    [("killed at a rename", 3), pytest.param("disk full at a sync", 4, marks=pytest.mark.slow)],
+    [
+        ("killed at a rename", 3),
+        *(
+            pytest.param(kind, 4, marks=pytest.mark.slow)
+            for kind in ("killed at a write", "killed at a sync", "disk full at a sync")
+        ),
+    ],
 )
 def test_a_command_given_again_after_a_fault_ends_as_an_undisturbed_one(
     kind: str, when: int, out: pathlib.Path
