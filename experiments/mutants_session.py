@@ -27,6 +27,8 @@ PATIENCE = 10.0
 SHORTEST_PATIENCE = 60.0
 """Seconds that every mutant has at least."""
 
+GUARDS = ("strict", "frozen")
+"""Arguments, of `zip` and of `dataclass`, that refuse what a correct program does not do, and change no result."""
 _BINARY = (
     "Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "FloorDiv_Mul", "Mod_Mul", "Pow_Mul", "BitAnd_BitOr", "BitOr_BitAnd",
     "BitXor_BitOr", "LShift_RShift", "RShift_LShift",
@@ -151,14 +153,16 @@ def _prepare(
             _skip(database, files.read_text(copy / module))
     elif before["tests"] != now["tests"]:
         _forget_survivors(session)
+        with use_db(str(session)) as database:
+            _skip(database, files.read_text(copy / module))
     files.write_json(stamp, now)
 
 
 def _skip(database: Any, source: str) -> None:
-    """Mark as skipped what is not to be run: other operators, annotations, and a star that multiplies nothing."""
+    """Mark as skipped what is not to be run: other operators, `left_alone`, and a star that multiplies nothing."""
     from cosmic_ray.work_item import WorkerOutcome, WorkResult
 
-    spans, lines = annotation_spans(source), source.splitlines()
+    spans, lines = left_alone(source), source.splitlines()
     for item in database.pending_work_items:
         (mutation,) = item.mutations
         row, column = mutation.start_pos
@@ -168,12 +172,18 @@ def _skip(database: Any, source: str) -> None:
             database.set_result(item.job_id, WorkResult(worker_outcome=WorkerOutcome.SKIPPED))
 
 
-def annotation_spans(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return where the annotations of a module begin and end: line, from 1, and column, from 0."""
+def left_alone(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Return where annotations, and the values of the arguments `GUARDS`, begin and end in a module.
+
+    Returns:
+      Begin and end of each: line, from 1, and column, from 0.
+    """
     found: list[ast.expr | None] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.arg | ast.AnnAssign):
             found.append(node.annotation)
+        elif isinstance(node, ast.keyword) and node.arg in GUARDS:
+            found.append(node.value)
         elif isinstance(node, ast.FunctionDef):
             found.append(node.returns)
     return [((n.lineno, n.col_offset), (n.end_lineno or 0, n.end_col_offset or 0)) for n in found if n]

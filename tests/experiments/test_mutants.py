@@ -89,8 +89,14 @@ def test_the_box_has_the_commit_of_every_module() -> None:
 def test_annotations_are_found_and_nothing_else() -> None:
     source = "def f(a: int | None = 1 | 2) -> int | str:\n    b: int | None = 3 | 4\n    return b\n"
     lines = source.splitlines()
-    found = sorted(lines[row - 1][begin:end] for (row, begin), (_, end) in mutants_session.annotation_spans(source))
+    found = sorted(lines[row - 1][begin:end] for (row, begin), (_, end) in mutants_session.left_alone(source))
     assert found == ["int | None", "int | None", "int | str"]
+
+
+def test_arguments_that_guard_are_left_alone() -> None:
+    source = "for a in zip(b, c, strict=True):\n    d(frozen=True, other=True)\n"
+    found = [(begin, end) for begin, end in mutants_session.left_alone(source)]
+    assert sorted(found) == [((1, 25), (1, 29)), ((2, 13), (2, 17))]
 
 
 def test_the_changed_line_of_a_diff() -> None:
