@@ -96,7 +96,7 @@ def test_annotations_are_found_and_nothing_else() -> None:
 def test_arguments_that_guard_are_left_alone() -> None:
     source = "for a in zip(b, c, strict=True):\n    d(frozen=True, other=True)\n"
     found = [(begin, end) for begin, end in mutants_session.left_alone(source)]
-    assert sorted(found) == [((1, 25), (1, 29)), ((2, 13), (2, 17))]
+    assert sorted(found) == [((1, 26), (1, 30)), ((2, 13), (2, 17))]
 
 
 def test_the_changed_line_of_a_diff() -> None:
