@@ -32,8 +32,8 @@ def _base(name: str, goals: dict[str, str]) -> str:
 
 def _has_goal(name: str, base: str) -> bool:
     """Return whether a goal of benchmark `base` is about a figure: the only one, that of a count, or of a preset."""
-    last = name.rpartition("/")[2]
-    return name == base or last.isdigit() or last in ("compact", "paper")
+    of = name.removeprefix(f"{base}/")
+    return name == base or of.isdigit() or of in ("compact", "paper")
 
 
 def headline(figures: Figures, known: Collection[str]) -> str:

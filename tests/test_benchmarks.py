@@ -43,13 +43,20 @@ def test_figures_that_miss_their_goals_are_named() -> None:
     figures = {
         "render.vs_raycast": 20.0,
         "train.saving": 1.04,
-        "train.saving/in_line": 9.0,  # has no goal
+        "train.saving/in_line": 9.0,  # has no goal, and neither has the next
+        "drops.cheaper/p_height/7": 0.5,
         "push_net.vs_torch/paper": 0.5,
         "push_net.vs_torch/paper_memory": 0.5,
         "rates.mjx/push/7": 1.0,
     }
     said = "1 of 3 figures with a goal reach it. Missed: `train.saving` (1.04, goal <= 1.03), `push_net.vs_torch/paper`"
-    known = ("render.vs_raycast", "train.saving", "storage.vs_images", "jobs.overhead")  # the last one has no goal
+    known = (
+        "render.vs_raycast",
+        "train.saving",
+        "drops.cheaper",
+        "storage.vs_images",
+        "jobs.overhead",
+    )  # the last one has no goal
     assert page.headline(figures, known) == f"{said} (0.5, goal >= 1). Not measured: `storage.vs_images`."
     said = "1 of 1 figures with a goal reach it. Missed: none. Not measured: none."
     assert page.headline({"render.vs_raycast": 20.0}, known[:1]) == said
@@ -66,6 +73,9 @@ def test_the_page_of_large_data_sets_shows_the_figures_in_docs() -> None:
     at = " ".join(text.split())
     assert f"write {round(written, -4):,.0f} pushes" in at and f"reads {round(read, -4):,.0f} a second" in at
     assert f"a million in {1e6 / read:.0f} s" in at
+    one, key = [f"{fast[f'train.first_step/{what}']:.0f}" for what in ("seconds", "seconds_in_files")], "megabytes"
+    size, small = (f"{fast[f'train.first_step/{key}{end}'] / 1000:.1f} GB" for end in ("", "_in_files"))
+    assert f"takes {one[0]} s and {size} of memory, and with `--memory 0.1` {one[1]} s and {small}" in at
     gpu = json.loads((DOCS / "benchmarks-h200.json").read_text())
     cores = gpu["machine"]["cores"]
     most = {
