@@ -193,7 +193,7 @@ sys.exit(command.main("x", "What.", listed, arguments=["--out", sys.argv[2]]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_interrupted_command_saves_and_continues(tmp_path: pathlib.Path, number: int) -> None:
     (tmp_path / "slow.py").write_text(SLOW)
     words = [sys.executable, "-c", MAIN, str(tmp_path / "slow.py"), str(tmp_path)]

@@ -220,6 +220,7 @@ def test_speed_and_memory_are_said_beside_the_losses(tmp_path: pathlib.Path) -> 
     assert log.Log(tmp_path / "other", 0, batch=4, writes=False).write(10, {"loss": 0.5}) == ""
 
 
+@pytest.mark.slow
 def test_a_hard_stop_inside_a_line_of_metrics_is_survived(task: PushTask, tmp_path: pathlib.Path) -> None:
     fit(task, BRIEF, tmp_path)
     whole = (tmp_path / "metrics.jsonl").read_text()

@@ -37,6 +37,7 @@ def test_a_view_of_turned_poses_is_the_turned_view(settled: Any) -> None:
     assert both.sum() / either.sum() > 0.95  # half a pixel of sampling all around objects of some 30 pixels
 
 
+@pytest.mark.slow
 def test_gradients_of_height_are_finite(settled: Any) -> None:
     scene, poses = structs.take(settled.scene, 0), jnp.asarray(settled.poses[0])
     scene = scene.replace(shape=np.where(np.arange(len(scene.shape)) == 1, ABSENT, scene.shape))
