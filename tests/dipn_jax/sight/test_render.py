@@ -3,6 +3,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from dipn_jax import geometry, structs
 from dipn_jax.physics import native
