@@ -77,19 +77,11 @@ def test_nodes_and_workers_that_are_lost_change_nothing(
     """In the middle a node is removed and workers are killed; then the command is given again, with shards missing."""
     import ray_cluster
 
-    run, lost = launch.run, []
-
-    def losing(*args: Any, **named: Any) -> Iterator[tuple[int, Any]]:
-        for one in run(*args, **named):
-            if not lost:
-                cluster.remove_node(cluster.nodes.pop(), allow_graceful=False)
-                lost.append(ray_cluster.kill_workers(cluster))
-            yield one
-
+    lost: list[int] = []
     out = tmp_path / "out"
     words = [*WORDS, "--out", str(out), "--launcher", "ray"]
     with ray_cluster.of_nodes(3) as cluster:
-        monkeypatch.setattr(launch, "run", losing)
+        monkeypatch.setattr(launch, "run", ray_cluster.losing(cluster, launch.run, lost))
         assert console.run("test", cli.COMMANDS, words) == 0
         assert lost and lost[0] >= 1
         assert _bytes(out) == _bytes(alone) and records.missing(out) is None

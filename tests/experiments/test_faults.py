@@ -55,7 +55,9 @@ def test_a_fault_that_is_not_reached_is_tried_nearer(tmp_path: pathlib.Path, mon
     assert tried == [9, 7, 5]
     (kept,) = (tmp_path / "points").iterdir()
     found = files.read_json(kept)
-    assert (found["when"], found["reached"], found["wrong"]) == (5, 1, 1), "what came of others counts, too"
+    assert (found["when"], found["reached"], found["wrong"]) == (5, 1, 1), (
+        "a wrong result of a try that was not reached is counted, too"
+    )
     faults._try(listed[1], SMALL, tmp_path, "these", listed=listed)
     assert tried == [9, 7, 5, 10, 8, 4], "5 has been tried"
     assert faults.nearer(Point("generate", kind, 1), listed) == []

@@ -6,7 +6,7 @@ import contextlib
 import os
 import pathlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 
@@ -41,3 +41,22 @@ def kill_workers(cluster: Any) -> int:
                 os.kill(int(folder.name), signal.SIGKILL)
                 killed += 1
     return killed
+
+
+def losing(cluster: Any, run: Callable[..., Any], lost: list[int]) -> Callable[..., Iterator[tuple[int, Any]]]:
+    """Return `launch.run` that removes a node and kills all workers once, when the first task has ended.
+
+    Args:
+      cluster: what `of_nodes` yields.
+      run: `launch.run`.
+      lost: the number of workers killed is appended to it.
+    """
+
+    def running(*args: Any, **named: Any) -> Iterator[tuple[int, Any]]:
+        for one in run(*args, **named):
+            if not lost:
+                cluster.remove_node(cluster.nodes.pop(), allow_graceful=False)
+                lost.append(kill_workers(cluster))
+            yield one
+
+    return running

@@ -90,18 +90,10 @@ def test_a_cluster_that_loses_nodes_makes_the_evaluation_of_one_machine(
     """A node is removed and workers are killed when the first part is there."""
     import ray_cluster
 
-    run, lost = launch.run, []
-
-    def losing(*args: Any, **named: Any) -> Iterator[tuple[int, Any]]:
-        for one in run(*args, **named):
-            if not lost:
-                cluster.remove_node(cluster.nodes.pop(), allow_graceful=False)
-                lost.append(ray_cluster.kill_workers(cluster))
-            yield one
-
+    lost: list[int] = []
     assert _run(tmp_path / "alone", tiny["grasp"]) == 0
     with ray_cluster.of_nodes(3) as cluster:
-        monkeypatch.setattr(launch, "run", losing)
+        monkeypatch.setattr(launch, "run", ray_cluster.losing(cluster, launch.run, lost))
         assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray", "--of", "3") == 0
     assert lost and lost[0] >= 1
     for name in ("metrics.json", "episodes.json", "episodes/002.npz"):
