@@ -13,7 +13,8 @@ def compute_in(model: nnx.Module, precision: str) -> None:
 
     Args:
       model: the network; it is changed.
-      precision: float32 leaves it alone; or bfloat16, whose sums and statistics Flax keeps in float32.
+      precision: float32 leaves it alone; with bfloat16, layers round their inputs and weights to it and give their
+        outputs in it. Statistics of batches, positions along a push, and the outputs of whole networks stay float32.
     """
     if precision == "float32":
         return

@@ -140,7 +140,8 @@ class DIPN(nnx.Module):
         Returns:
           dx, dy in pixels and dtheta in degrees, push frame; 0 for objects out of sight.
         """
-        return jnp.where(inputs.present[..., None, None], self.body(inputs, distances), 0.0)
+        motion = self.body(inputs, distances).astype(jnp.float32)
+        return jnp.where(inputs.present[..., None, None], motion, 0.0)
 
 
 def symmetric(network: DIPN, inputs: PushInput, distances: Float[Array, "B K"]) -> Float[jax.Array, "B N K 3"]:

@@ -112,7 +112,7 @@ class GraspNet(nnx.Module):
         Args:
           images: RGB in [0, 1] and height in metres; sides divisible by 8 (`paper`: 32).
         """
-        return self.body(_normalized(images))
+        return self.body(_normalized(images)).astype(jnp.float32)
 
 
 def _normalized(images: Float[jax.Array, "*b H W 4"]) -> Float[jax.Array, "*b H W 4"]:

@@ -137,5 +137,5 @@ class Stepwise(nnx.Module):
             heard = nnx.relu(first(state)[:, :, None] + second(state)[:, None] + edge(pair))
             heard = jnp.where(others, nnx.relu(message(heard)), 0.0).sum(2)
             state = state + update(jnp.concatenate([state, heard], -1))
-        delta = MOTION_SCALE * self.motion(nnx.relu(state)).reshape(b, n, STEP_CENTIMETRES, 3)
+        delta = MOTION_SCALE * self.motion(nnx.relu(state)).astype(jnp.float32).reshape(b, n, STEP_CENTIMETRES, 3)
         return hidden + jnp.tanh(self.memory(nnx.relu(state))), delta

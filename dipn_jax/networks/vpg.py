@@ -99,7 +99,7 @@ class _Trunks(nnx.Module):
         y = jnp.concatenate([self.color(x[..., :3]), self.depth(jnp.repeat(x[..., 3:], 3, -1))], -1)
         for norm, conv in zip(self.norms, self.head, strict=True):
             y = conv(nnx.relu(norm(y)))
-        return jax.image.resize(y, (b, h, w, 1), "bilinear")[..., 0]
+        return jax.image.resize(y.astype(jnp.float32), (b, h, w, 1), "bilinear")[..., 0]
 
 
 class VPG(nnx.Module):

@@ -267,6 +267,17 @@ def test_layers_compute_in_half_precision_and_weights_stay() -> None:
         np.testing.assert_allclose(leaf, single[name], atol=0.01)
 
 
+@pytest.mark.slow
+def test_half_precision_learns_what_single_precision_does(
+    task: PushTask, alone: list[dict[str, float]], tmp_path: pathlib.Path
+) -> None:
+    fit(task, WHOLE, tmp_path, compute=Compute(precision="bfloat16"))
+    for one, other in zip(alone, files.read_lines(tmp_path / "metrics.jsonl"), strict=True):
+        assert one["held_out_loss"] != other["held_out_loss"]
+        assert abs(other["loss"] / one["loss"] - 1) < 0.02
+        assert abs(other["held_out_loss"] / one["held_out_loss"] - 1) < 0.1
+
+
 def test_some_steps_are_profiled(tmp_path: pathlib.Path) -> None:
     with profiling.Profiler(tmp_path, 7) as profiler:
         for step in range(7, 7 + profiling.LAST):
