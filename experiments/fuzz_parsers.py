@@ -206,7 +206,7 @@ def _parsers() -> list[Parser]:
         Parser("metrics", "metrics.json", _save_cleared, _report, tree),
         Parser("log", "metrics.jsonl", _log, lambda at: curves.load_grasp_runs([at]), lines),
         Parser("training", "config.json", _begin_training, _go_on_training, tree),
-        Parser("examples", "whole.json", _keep_examples, _keep_examples, tree),
+        Parser("examples", "state.json", _keep_examples, _keep_examples, tree),
         Parser("stamp", runs.STAMP, _stamp, lambda at: runs.is_complete(_run(at), "key"), tree),
     ]
 

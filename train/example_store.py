@@ -13,12 +13,12 @@ import numpy as np
 from dipn_jax import batching, structs
 from dipn_jax.commands import console
 from dipn_jax.storage.space import Space, require_room
-from dipn_jax.system import files
+from dipn_jax.system import files, machine
 
 _LARGEST = 1e6
 """Bytes that an example takes at most: tenfold those of a push of thirty objects."""
-_WHOLE = "whole.json"
-"""File that says what the examples are of, and that none was cut off while it was written."""
+_STATE = "state.json"
+"""File that says what the examples are of, and since which start of the machine they are in its memory, if they are."""
 
 
 class Kept:
@@ -75,7 +75,8 @@ class Kept:
 class ExampleStore:
     """Examples in files that are mapped into memory; the operating system caches them.
 
-    A later process reuses them if the one that made them has closed them; after a hard stop they are made again.
+    A later process reuses them if the one that made them has closed them, or was killed: the machine's memory still has
+    what was written. If the machine was started since, they are made again.
     """
 
     def __init__(self, folder: pathlib.Path, make: Callable[[np.ndarray], Any], count: int, *, about: str) -> None:
@@ -90,6 +91,7 @@ class ExampleStore:
         self._folder, self._make, self._count, self._about = folder, make, count, about
         self._arrays: list[np.ndarray] | None = None
         self._structure: Any = None
+        self._said: dict[str, Any] = {}
 
     def take(self, index: np.ndarray) -> Any:
         """Return the examples `index [B]`; those that are not there yet are made."""
@@ -115,12 +117,14 @@ class ExampleStore:
         shapes = [((self._count, *np.shape(leaf)[1:]), np.asarray(leaf).dtype) for leaf in leaves]
         shapes.append(((self._count,), np.dtype(bool)))
         about = {"about": self._about, "shapes": [[list(shape), kind.name] for shape, kind in shapes]}
-        whole = self._folder / _WHOLE
-        known = whole.exists() and files.read_json(whole) == about
-        whole.unlink(missing_ok=True)
+        state = self._folder / _STATE
+        found = files.read_json(state) if state.exists() else {}
+        since = found.pop("in_memory_since", None)
+        known = found == about and since in (None, machine.boot())
         if not known:
             shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(parents=True, exist_ok=True)
+        state.unlink(missing_ok=True)
         size = sum(int(np.prod(shape)) * kind.itemsize for shape, kind in shapes)
         console.say(f"{self._folder}: up to {size / 1e9:.1f} GB of examples are kept there, each made when first used")
         self._arrays = [
@@ -130,6 +134,8 @@ class ExampleStore:
             for number, (shape, kind) in enumerate(shapes)
         ]
         self._said = about
+        if machine.boot():
+            files.write_json(state, about | {"in_memory_since": machine.boot()})
 
     def close(self) -> None:
         """Write what is left to the disk, so that another process can take the examples up."""
@@ -137,10 +143,10 @@ class ExampleStore:
             for array in self._arrays:
                 array.flush()  # type: ignore[attr-defined]
             self._arrays = None
-            files.write_json(self._folder / _WHOLE, self._said)
+            files.write_json(self._folder / _STATE, self._said)
 
 
 def _filled(index: np.ndarray) -> np.ndarray:
-    """Return numbers repeated to fill batches of `batching`, so that few shapes are compiled."""
-    size = batching.BATCH if len(index) > batching.SMALL_BATCH else batching.SMALL_BATCH
-    return np.resize(index, -(-len(index) // size) * size)
+    """Return numbers repeated to 16, 32 or a multiple of 64 of them, so that few shapes are compiled."""
+    small = next((size for size in (batching.SMALL_BATCH, batching.BATCH // 2) if len(index) <= size), batching.BATCH)
+    return np.resize(index, -(-len(index) // small) * small)

@@ -29,6 +29,18 @@ def instructions(*, info: pathlib.Path = pathlib.Path("/proc/cpuinfo")) -> str:
     return next((level for level, needed in levels.items() if needed <= flags), platform.machine().replace("_", "-"))
 
 
+def boot(*, file: pathlib.Path = pathlib.Path("/proc/sys/kernel/random/boot_id")) -> str | None:
+    """Return what tells this start of the machine from others; None where the system does not say it.
+
+    Args:
+      file: where Linux says it.
+    """
+    try:
+        return file.read_text(encoding="ascii").strip() or None
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
 def cores(
     *, groups: pathlib.Path = pathlib.Path("/sys/fs/cgroup"), own: pathlib.Path = pathlib.Path("/proc/self")
 ) -> int:

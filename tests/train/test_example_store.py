@@ -2,6 +2,9 @@
 
 import pathlib
 import shutil
+import signal
+import subprocess
+import sys
 from typing import Any
 
 import jax
@@ -18,6 +21,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage.space import SPARE, Space
+from dipn_jax.system import machine
 
 
 class Maker:
@@ -65,8 +69,9 @@ def test_a_disk_that_is_nearly_full_is_one_line(tmp_path: pathlib.Path, monkeypa
 
 
 def test_what_was_closed_is_taken_up_and_nothing_else(
-    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(machine, "boot", lambda: None)
     store, _ = _store(tmp_path / "s")
     _check(store, [1, 2])
     store.close()
@@ -81,6 +86,49 @@ def test_what_was_closed_is_taken_up_and_nothing_else(
     other, maker = _store(tmp_path / "s", about="other squares")
     _check(other, [1, 2])
     assert set(maker.made) == {1, 2}
+
+
+KILLED = """
+import os, pathlib, signal, sys
+import numpy as np
+from dipn_jax.train.example_store import ExampleStore
+
+def make(index):
+    return {"square": (index**2).astype(np.float32), "row": np.stack([index, -index], 1)}
+
+store = ExampleStore(pathlib.Path(sys.argv[1]), make, 100, about="squares")
+store.take(np.array([1, 2, 70]))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+"""A process that makes three examples and is killed."""
+
+
+@pytest.mark.skipif(machine.boot() is None, reason="this system does not tell its starts apart")
+def test_what_a_killed_process_made_is_used_unless_the_machine_was_started_since(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for boot, made in (machine.boot(), [1, 5]), ("another", [1, 2, 5, 70]):
+        killed = subprocess.run(
+            [sys.executable, "-c", KILLED, str(tmp_path / "s")], check=False, stdout=subprocess.PIPE
+        )
+        assert killed.returncode == -signal.SIGKILL
+        monkeypatch.setattr(machine, "boot", lambda boot=boot: boot)
+        store, maker = _store(tmp_path / "s")
+        _check(store, [1, 2, 5, 70])
+        assert sorted(set(maker.made)) == made, "the first one is made in any case, to see shapes"
+        shutil.rmtree(tmp_path / "s")
+
+
+@pytest.mark.parametrize(("count", "size"), [(1, 16), (16, 16), (17, 32), (32, 32), (33, 64), (65, 128)])
+def test_few_sizes_of_batches_are_made(count: int, size: int, tmp_path: pathlib.Path) -> None:
+    sizes: list[int] = []
+
+    def make(index: np.ndarray) -> np.ndarray:
+        sizes.append(len(index))
+        return index
+
+    ExampleStore(tmp_path / "s", make, 100, about="numbers").take(np.arange(count))
+    assert sizes == [16, size], "one, to see shapes, and then all"
 
 
 @pytest.mark.parametrize("memory", [0.00001, 1.0])
@@ -105,7 +153,7 @@ def test_tasks_learn_from_the_same_examples(kind: str, data: dict[str, pathlib.P
     index = np.array([3, 0, 17, 3])
     stored, kept = large.fetch(index), task().fetch(index)
     large.close()
-    assert (tmp_path / "s" / "whole.json").exists()
+    assert (tmp_path / "s" / "state.json").exists()
     for one, other in zip(jax.tree.leaves(stored), jax.tree.leaves(kept), strict=True):
         assert one.dtype == other.dtype
         np.testing.assert_array_equal(one, other)
@@ -125,7 +173,7 @@ def test_the_command_keeps_them_beside_the_run_and_closes_them(
         out = tmp_path / "-".join(("run", *extra))
         words = ["grasp", "--data", str(data["grasp"]), "--out", str(out), *extra]
         assert console.run("test", cli.COMMANDS, words) == 0
-        assert (out / "examples" / "0" / "whole.json").exists() == wanted
+        assert (out / "examples" / "0" / "state.json").exists() == wanted
         said = capsys.readouterr().out
         assert ("of episodes are kept" in said) == ("--memory" in extra)
         assert ("of examples are kept" in said) == bool(extra), "only one is made where nothing but a step is compiled"
