@@ -23,6 +23,7 @@ from dipn_jax.system import files
 from dipn_jax.system.interruption import Interruption
 
 from . import devices, finite, log, order, precision, profiling
+from .ahead import Ahead
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check
 from .optimizers import make_optimizer
 
@@ -183,20 +184,24 @@ def _fit(
             saver.save(step, parts, extra=about)
 
     step, saver = begin, saving.Saver(out, network=task.network, config=task.network_config)
+    ahead = Ahead(lambda k: task.fetch(where.rows(np.asarray(batches[k]))), begin, config.steps)
     progress = console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin, quiet=not where.leads)
     profiled = profiling.Profiler(compute.profile if where.leads else None, begin)
-    with progress, Interruption() as interruption, saver, profiled:
+    with progress, Interruption() as interruption, saver, profiled, ahead:
         while step < config.steps:
             profiled.see(step)
-            batch = where.share(task.fetch(where.rows(np.asarray(batches[step]))))
+            batch = where.share(ahead.take())
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
             watch.see(step, where.here(loss))
             step += 1
+            if step == begin + 1:
+                curve.resume(step)  # it has been compiled
             stopping = where.any_says(interruption.requested, step)
             evaluating = step % config.eval_every == 0 or step == config.steps
             due = step % config.save_every == 0 or step == config.steps or stopping
             if evaluating or due:
                 watch.check(step, where.here((params, rest, moments)))
+                curve.pause(step)
             if evaluating:
                 model = nnx.merge(graph, *where.here((params, rest)))
                 model.eval()
@@ -210,6 +215,8 @@ def _fit(
             if stopping:
                 saver.wait()
                 raise KeyboardInterrupt
+            if evaluating or due:
+                curve.resume(step)
             progress.advance(1, " ".join([*(f"{k} {v:.3f}" for k, v in latest.items()), speed]))
     where.wait("done")
     curve.close()

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dipn_jax.train import log
+from dipn_jax.train import devices, log
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.loop import TrainConfig, fit
 from dipn_jax.train.push import PushTask
@@ -50,16 +50,15 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(
     task = _task(name, data)
     fit(task, BRIEF, tmp_path / "whole")
     calls = 0
-    fetch = task.fetch
 
-    def interrupt(index: np.ndarray) -> object:
+    def interrupt(_: object, examples: object) -> object:
         nonlocal calls
         calls += 1
         if calls == 4:
             os.kill(os.getpid(), signal.SIGTERM)  # the current step is finished first
-        return fetch(index)
+        return examples
 
-    monkeypatch.setattr(task, "fetch", interrupt)
+    monkeypatch.setattr(devices.OneDevice, "share", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fit(task, BRIEF, tmp_path / "cut")
     assert checkpoint.newest(tmp_path / "cut")[1]["step"] == 4  # type: ignore[index]
@@ -118,16 +117,15 @@ def test_an_interrupted_run_says_that_its_last_step_cannot_be_saved(
 ) -> None:
     """Not that the same command continues from there."""
     task = _task("push", data)
-    fetch = task.fetch
 
-    def interrupt(index: np.ndarray) -> object:
+    def interrupt(_: object, examples: object) -> object:
         os.kill(os.getpid(), signal.SIGTERM)
-        return fetch(index)
+        return examples
 
     def full(*_: Any) -> None:
         raise UserError("step 1 cannot be saved")
 
-    monkeypatch.setattr(task, "fetch", interrupt)
+    monkeypatch.setattr(devices.OneDevice, "share", interrupt)
     monkeypatch.setattr(checkpoint, "_write", full)
     with pytest.raises(UserError, match="step 1 cannot be saved"):
         fit(task, BRIEF, tmp_path)
