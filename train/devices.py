@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import concurrent.futures
 import os
+import re
 import socket
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -25,6 +26,8 @@ PATIENCE = 300
 """Seconds that a process waits for the others of its job."""
 SILENCE = 10
 """Seconds after which it says that it does."""
+OWN_GPUS = ("SLURM_GPUS_PER_TASK", "SLURM_TRES_PER_TASK")
+"""Variables of SLURM that say that each process has GPUs of its own."""
 
 
 class OneDevice:
@@ -112,7 +115,13 @@ def placement(compute: Compute, *, batch: int) -> OneDevice:
     Raises:
       UserError: the devices cannot share a batch equally.
     """
-    return Shared(jax.devices(), batch=batch) if compute.data_parallel else OneDevice()
+    if not compute.data_parallel:
+        return OneDevice()
+    shared = Shared(jax.devices(), batch=batch)
+    if shared.leads:
+        here, processes = jax.device_count(), jax.process_count()
+        console.say(f"--data-parallel: {here} devices ({jax.default_backend()}) of {processes} processes share a batch")
+    return shared
 
 
 def join(compute: Compute) -> None:
@@ -131,7 +140,57 @@ def join(compute: Compute) -> None:
         who = compute.coordinator, compute.processes, compute.process
         _in_time(lambda: jax.distributed.initialize(*who, initialization_timeout=2 * PATIENCE), given)
     elif _started_as_several():
-        _in_time(lambda: jax.distributed.initialize(initialization_timeout=2 * PATIENCE), "the job manager's processes")
+        own = local_devices(os.environ)
+        _in_time(
+            lambda: jax.distributed.initialize(local_device_ids=own, initialization_timeout=2 * PATIENCE),
+            "the job manager's processes",
+        )
+
+
+def local_devices(environment: Mapping[str, str]) -> list[int] | None:
+    """Return the numbers of the GPUs that this process of SLURM or Open MPI takes of those that it sees.
+
+    Where the processes of a machine see the same GPUs, each takes an equal share; where a process is alone there, or
+    sees its own, it takes all that it sees. JAX would take one GPU a process, and leave the others idle.
+
+    Args:
+      environment: environment variables.
+
+    Returns:
+      The numbers; None where the variables do not say how many GPUs or processes there are, or where the processes
+      cannot share equally: then JAX decides.
+    """
+    local = environment.get("SLURM_LOCALID", environment.get("OMPI_COMM_WORLD_LOCAL_RANK", ""))
+    count, here = _visible_gpus(environment), _processes_here(environment)
+    if not count or not here or not local.isdecimal():
+        return None
+    if here == 1 or count < here or any(name in environment for name in OWN_GPUS):
+        return list(range(count))
+    share = count // here
+    return None if count % here else list(range(int(local) * share, (int(local) + 1) * share))
+
+
+def _visible_gpus(environment: Mapping[str, str]) -> int:
+    """Return the number of GPUs that a process sees; 0 if no variable says it."""
+    if listed := environment.get("CUDA_VISIBLE_DEVICES", environment.get("ROCR_VISIBLE_DEVICES")):
+        return len(listed.split(","))
+    there = environment.get("SLURM_GPUS_ON_NODE", "")
+    return int(there) if there.isdecimal() else 0
+
+
+def _processes_here(environment: Mapping[str, str]) -> int:
+    """Return the number of the job's processes on this machine; 0 if no variable says it."""
+    there = environment.get("OMPI_COMM_WORLD_LOCAL_SIZE", "")
+    if there.isdecimal():
+        return int(there)
+    counts: list[int] = []
+    for part in environment.get("SLURM_STEP_TASKS_PER_NODE", "").split(","):  # such as 4(x2),3
+        found = re.fullmatch(r"(\d+)(?:\(x(\d+)\))?", part)
+        if found is None:
+            return 0
+        counts += [int(found[1])] * int(found[2] or 1)
+    node = environment.get("SLURM_NODEID", "")
+    return counts[int(node)] if node.isdecimal() and int(node) < len(counts) else 0
 
 
 def _require_port(coordinator: str) -> None:

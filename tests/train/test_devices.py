@@ -35,9 +35,9 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.train import devices
 from dipn_jax.train.configs import Compute, TrainConfig
 
-data, out, coordinator, process = sys.argv[1:]
+data, out = sys.argv[1:]
 console.enable_compilation_cache()
-compute = Compute(data_parallel=True, coordinator=coordinator, processes=2, process=int(process))
+compute = Compute(data_parallel=True)
 devices.join(compute)
 
 import jax, os, signal
@@ -46,20 +46,20 @@ from dipn_jax.train.push import PushTask
 
 assert jax.device_count() == 4 and jax.local_device_count() == 2
 task = PushTask(pathlib.Path(data), DipnConfig(width=8), limit=None, centimetres=(5, 10))
-own, fetched = task.fetch, []
+own, shared = devices.Shared.share, []
 
-def fetch(index):
-    fetched.append(index)
-    if process == "1" and len(fetched) == 5:
+def share(self, examples):
+    shared.append(len(examples.taught))
+    if jax.process_index() == 1 and len(shared) == 5:
         os.kill(os.getpid(), signal.SIGTERM)
-    return own(index)
+    return own(self, examples)
 
-task.fetch = fetch
+devices.Shared.share = share
 plan = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=100)
 try:
     fit(task, plan, pathlib.Path(out), compute=compute)
 except KeyboardInterrupt:
-    sys.exit(0 if len(fetched) == devices.SYNC_EVERY and len(fetched[0]) == 2 else 1)
+    sys.exit(0 if shared == [2] * devices.SYNC_EVERY else 1)
 sys.exit("was not interrupted")
 """
 """DIPN learns on four devices of two processes; the second one is interrupted in the middle, which ends both."""
@@ -85,16 +85,19 @@ fit(task, plan, pathlib.Path(sys.argv[2]), compute=Compute(data_parallel=True))
 
 
 def _start(data: pathlib.Path, out: pathlib.Path) -> None:
-    """Run the script in two processes of two devices each."""
+    """Run the script in two processes of two devices each, which find one another by the variables that SLURM sets."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        coordinator = f"127.0.0.1:{free.getsockname()[1]}"
+        port = free.getsockname()[1]
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
-    words = [sys.executable, "-c", SCRIPT, str(data), str(out), coordinator]
-    going = [
-        subprocess.Popen([*words, str(each)], env=os.environ | flags, stderr=subprocess.PIPE, text=True)
-        for each in range(2)
-    ]
+    job = {"SLURM_JOB_ID": "7", "SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2", "SLURM_STEP_NODELIST": "localhost"}
+    flags |= job | {"JAX_COORDINATOR_PORT": str(port)}
+    words = [sys.executable, "-c", SCRIPT, str(data), str(out)]
+    going = []
+    for each in range(2):
+        own = {"SLURM_PROCID": str(each), "SLURM_LOCALID": str(each)}
+        started = subprocess.Popen(words, env=os.environ | flags | own, stderr=subprocess.PIPE, text=True)
+        going.append(started)
     said = [process.communicate(timeout=300)[1] for process in going]
     assert [process.returncode for process in going] == [0, 0], said[0][-3000:]
     assert "train dipn" not in said[1], "one of them says how far the run is"
@@ -217,6 +220,29 @@ def test_a_process_joins_others_where_a_job_manager_started_several(monkeypatch:
             assert len(joined) == wanted, name
 
 
+@pytest.mark.parametrize(
+    ("environment", "wanted"),
+    [
+        ("SLURM_LOCALID=0 SLURM_NODEID=1 SLURM_STEP_TASKS_PER_NODE=1(x2) CUDA_VISIBLE_DEVICES=0,1,2,3", [0, 1, 2, 3]),
+        ("SLURM_LOCALID=0 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=1 SLURM_GPUS_ON_NODE=2", [0, 1]),
+        ("SLURM_LOCALID=2 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=4 CUDA_VISIBLE_DEVICES=0,1,2,3", [2]),
+        ("SLURM_LOCALID=1 SLURM_NODEID=2 SLURM_STEP_TASKS_PER_NODE=4(x2),2 CUDA_VISIBLE_DEVICES=0,1,2,3", [2, 3]),
+        ("SLURM_LOCALID=3 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=4 CUDA_VISIBLE_DEVICES=0", [0]),
+        (
+            "SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=2 CUDA_VISIBLE_DEVICES=0,1 SLURM_GPUS_PER_TASK=2",
+            [0, 1],
+        ),
+        ("OMPI_COMM_WORLD_LOCAL_RANK=1 OMPI_COMM_WORLD_LOCAL_SIZE=2 CUDA_VISIBLE_DEVICES=4,5,6,7", [2, 3]),
+        ("SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=3 CUDA_VISIBLE_DEVICES=0,1,2,3", None),
+        ("SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=odd CUDA_VISIBLE_DEVICES=0,1", None),
+        ("SLURM_LOCALID=0 SLURM_NODEID=5 SLURM_STEP_TASKS_PER_NODE=1 CUDA_VISIBLE_DEVICES=0,1", None),
+        ("SLURM_LOCALID=0 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=2", None),
+    ],
+)
+def test_no_gpu_of_a_machine_is_left_idle(environment: str, wanted: list[int] | None) -> None:
+    assert devices.local_devices(dict(word.split("=") for word in environment.split())) == wanted
+
+
 @pytest.mark.slow
 def test_a_step_is_compiled_and_nothing_written(task: PushTask, tmp_path: pathlib.Path) -> None:
     planned = fit(task, WHOLE, tmp_path / "run", compute=Compute(compile_only=True))
@@ -274,8 +300,8 @@ def test_half_precision_learns_what_single_precision_does(
     fit(task, WHOLE, tmp_path, compute=Compute(precision="bfloat16"))
     for one, other in zip(alone, files.read_lines(tmp_path / "metrics.jsonl"), strict=True):
         assert one["held_out_loss"] != other["held_out_loss"]
-        assert abs(other["loss"] / one["loss"] - 1) < 0.02
-        assert abs(other["held_out_loss"] / one["held_out_loss"] - 1) < 0.1
+        for name in ("loss", "held_out_loss"):
+            assert abs(other[name] / one[name] - 1) < 0.1
 
 
 def test_some_steps_are_profiled(tmp_path: pathlib.Path) -> None:
