@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pathlib
+import signal
 import socket
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from dipn_jax.storage import checkpoint
 from dipn_jax.system import files
 
 CONFIG = DipnConfig(width=8)
-WHOLE = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=100)
+WHOLE = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=4)
 RTOL = 1e-4
 """By what the numbers of a curve may differ."""
 SCRIPT = """
@@ -35,12 +36,12 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.train import devices
 from dipn_jax.train.configs import Compute, TrainConfig
 
-data, out = sys.argv[1:]
+data, out, sent = sys.argv[1:]
 console.enable_compilation_cache()
 compute = Compute(data_parallel=True)
+import functools, jax, os, signal
+jax.distributed.initialize = functools.partial(jax.distributed.initialize, heartbeat_timeout_seconds=10)
 devices.join(compute)
-
-import jax, os, signal
 from dipn_jax.train.loop import fit
 from dipn_jax.train.push import PushTask
 
@@ -51,18 +52,18 @@ own, shared = devices.Shared.share, []
 def share(self, examples):
     shared.append(len(examples.taught))
     if jax.process_index() == 1 and len(shared) == 5:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.Signals[sent])
     return own(self, examples)
 
 devices.Shared.share = share
-plan = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=100)
+plan = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=4)
 try:
     fit(task, plan, pathlib.Path(out), compute=compute)
 except KeyboardInterrupt:
     sys.exit(0 if shared == [2] * devices.SYNC_EVERY else 1)
 sys.exit("was not interrupted")
 """
-"""DIPN learns on four devices of two processes; the second one is interrupted in the middle, which ends both."""
+"""DIPN learns on four devices of two processes; the second one gets a signal at its fifth step, which ends both."""
 
 
 ONE_PROCESS = """
@@ -78,29 +79,34 @@ from dipn_jax.train.push import PushTask
 
 assert jax.device_count() == jax.local_device_count() == 4
 task = PushTask(pathlib.Path(sys.argv[1]), DipnConfig(width=8), limit=None, centimetres=(5, 10))
-plan = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=100)
+plan = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=4)
 fit(task, plan, pathlib.Path(sys.argv[2]), compute=Compute(data_parallel=True))
 """
 """DIPN learns on four devices of one process."""
 
 
-def _start(data: pathlib.Path, out: pathlib.Path) -> None:
-    """Run the script in two processes of two devices each, which find one another by the variables that SLURM sets."""
+def _start(data: pathlib.Path, out: pathlib.Path, sent: str) -> tuple[int, int]:
+    """Run the script in two processes of two devices each, which find one another by the variables that SLURM sets.
+
+    Returns:
+      Their exit codes.
+    """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     job = {"SLURM_JOB_ID": "7", "SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2", "SLURM_STEP_NODELIST": "localhost"}
     flags |= job | {"JAX_COORDINATOR_PORT": str(port)}
-    words = [sys.executable, "-c", SCRIPT, str(data), str(out)]
+    words = [sys.executable, "-c", SCRIPT, str(data), str(out), sent]
     going = []
     for each in range(2):
         own = {"SLURM_PROCID": str(each), "SLURM_LOCALID": str(each)}
         started = subprocess.Popen(words, env=os.environ | flags | own, stderr=subprocess.PIPE, text=True)
         going.append(started)
     said = [process.communicate(timeout=300)[1] for process in going]
-    assert [process.returncode for process in going] == [0, 0], said[0][-3000:]
+    print(said[0][-3000:])  # pytest shows it if a test fails
     assert "train dipn" not in said[1], "one of them says how far the run is"
+    return going[0].returncode, going[1].returncode
 
 
 @pytest.fixture(scope="module")
@@ -123,11 +129,21 @@ def test_four_devices_learn_what_one_does_and_one_goes_on_from_there(
     data: dict[str, pathlib.Path],
     tmp_path: pathlib.Path,
 ) -> None:
-    _start(data["push"], tmp_path)
+    assert _start(data["push"], tmp_path, "SIGTERM") == (0, 0)
     assert max(path.name for path in (tmp_path / "checkpoints").iterdir()) == f"{devices.SYNC_EVERY:08d}"
     fit(task, WHOLE, tmp_path)
     together = files.read_lines(tmp_path / "metrics.jsonl")
     _check(together, alone)
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_ends_the_others_and_nothing_saved_is_lost(
+    task: PushTask, alone: list[dict[str, float]], data: dict[str, pathlib.Path], tmp_path: pathlib.Path
+) -> None:
+    assert _start(data["push"], tmp_path, "SIGKILL") == (-signal.SIGABRT, -signal.SIGKILL)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["00000004"]
+    fit(task, WHOLE, tmp_path)
+    _check(files.read_lines(tmp_path / "metrics.jsonl"), alone)
 
 
 @pytest.mark.slow
