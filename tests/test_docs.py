@@ -4,6 +4,7 @@ import contextlib
 import functools
 import importlib
 import importlib.util
+import io
 import pathlib
 import re
 import shutil
@@ -29,6 +30,7 @@ SLOW = ("other_tools.md", "your_method.md")
 """Pages whose Python takes long."""
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`(dipn-(?:datagen|train|eval) [^`]+)`")
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
@@ -90,9 +92,31 @@ def test_commands_on_pages_exist(page: pathlib.Path, capfd: pytest.CaptureFixtur
                 tyro.cli(functools.wraps(moving_picture.main)(lambda **_: None), args=options)
             case ["python", "-m", module, *options] if module.startswith("experiments."):
                 assert importlib.import_module(module).main(["--dry-run", *options]) == 0, words
+            case ["srun", *rest]:
+                assert parsed(rest[next(i for i, word in enumerate(rest) if word in runs.PROGRAMS) :]), words
             case [program, *_]:
                 assert program in runs.PROGRAMS and parsed(words), words
     assert not capfd.readouterr().err
+
+
+@functools.cache
+def help_of(program: str, command: str) -> str:
+    """Return what `--help` of a command of ours prints."""
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+        console.run(program, importlib.import_module(runs.PROGRAMS[program]).COMMANDS, [command, "--help"])
+    return shown.getvalue()
+
+
+@each_page
+def test_commands_and_options_within_sentences_exist(page: pathlib.Path) -> None:
+    for words in (found.split() for found in INLINE.findall(FENCE.sub("", page.read_text()))):
+        program, command, *rest = words
+        known = importlib.import_module(runs.PROGRAMS[program]).COMMANDS
+        for name in command.split("|"):  # one of several
+            assert name in known or name.startswith("-"), words
+        for option in (word for word in rest if word.startswith("--") and command in known):
+            assert re.search(rf"{option}\b", help_of(program, command)), f"{option} of {' '.join(words)}"
 
 
 def test_the_readme_fits_on_a_screen_and_its_table_is_the_kept_one() -> None:
