@@ -232,13 +232,13 @@ def decide(
     return _count_actions(decision, observation, jnp.asarray(missed), estimate, rule)
 
 
-@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer", "plain"))
+@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer", "network_scores"))
 def decide_by_value(
     observation: Observation,
     push_scorer: Scorer,
     scorer: Scorer,
     *,
-    plain: Scorer | None = None,
+    network_scores: Scorer | None = None,
     distance: Float[Array, ""] | float,
     grasp_above: Float[Array, ""] | float = jnp.inf,
     top_margin: Float[Array, ""] | float = 0.0,
@@ -250,7 +250,8 @@ def decide_by_value(
       observation: what the camera sees now.
       push_scorer: values of pushes that start at each pixel in each of 16 directions.
       scorer: values of grasps, the best of which is chosen.
-      plain: values of grasps that are compared with those of pushes, where `scorer` lowers them; `scorer` by default.
+      network_scores: values of grasps that are compared with those of pushes, where `scorer` lowers them; `scorer`
+        by default.
       distance: push distance, metres.
       grasp_above: grasp at once if the best grasp's value by `scorer` is higher.
       top_margin: as of `Rule`.
@@ -262,7 +263,7 @@ def decide_by_value(
     image = render.rgbd(observation)
     known = candidates.discount_missed(scorer(image[None])[0], missed)
     pixel, score = candidates.grasp_from_top(known, observation.height, top_margin)
-    values = (plain or scorer)(image[None])[0]
+    values = (network_scores or scorer)(image[None])[0]
     grasp_value = candidates.discount_missed(values, missed)[tuple(pixel)]
     possible = fingers.pushable(observation.height)
     values = jnp.where(possible, push_scorer(image[None])[0], -jnp.inf)
