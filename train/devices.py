@@ -21,9 +21,9 @@ from .configs import Compute
 
 SYNC_EVERY = 10
 """Steps after which the processes of a job ask one another whether one of them has been interrupted."""
-PATIENCE = 300
+WAIT_LIMIT_SECONDS = 300
 """Seconds that a process waits for the others of its job."""
-SILENCE = 10
+WAIT_NOTICE_SECONDS = 10
 """Seconds after which it says that it does."""
 
 
@@ -129,9 +129,12 @@ def join(compute: Compute) -> None:
         if compute.process == 0:
             _require_port(compute.coordinator)
         who = compute.coordinator, compute.processes, compute.process
-        _in_time(lambda: jax.distributed.initialize(*who, initialization_timeout=2 * PATIENCE), given)
+        _in_time(lambda: jax.distributed.initialize(*who, initialization_timeout=2 * WAIT_LIMIT_SECONDS), given)
     elif _started_as_several():
-        _in_time(lambda: jax.distributed.initialize(initialization_timeout=2 * PATIENCE), "the job manager's processes")
+        _in_time(
+            lambda: jax.distributed.initialize(initialization_timeout=2 * WAIT_LIMIT_SECONDS),
+            "the job manager's processes",
+        )
 
 
 def _require_port(coordinator: str) -> None:
@@ -169,13 +172,13 @@ def _in_time(meet: Callable[[], None], given: str) -> None:
             met.set_result(None)
 
     threading.Thread(target=call, daemon=True).start()
-    if not concurrent.futures.wait([met], timeout=SILENCE).done:
-        console.note(f"{given}: waiting for the other processes, {PATIENCE:.0f} s at most")
-        concurrent.futures.wait([met], timeout=PATIENCE - SILENCE)
+    if not concurrent.futures.wait([met], timeout=WAIT_NOTICE_SECONDS).done:
+        console.note(f"{given}: waiting for the other processes, {WAIT_LIMIT_SECONDS:.0f} s at most")
+        concurrent.futures.wait([met], timeout=WAIT_LIMIT_SECONDS - WAIT_NOTICE_SECONDS)
     if not met.done():
         raise UserError(
-            f"{given}: not all processes came within {PATIENCE:.0f} s; look whether each of them was started, and can "
-            "reach process 0 there"
+            f"{given}: not all processes came within {WAIT_LIMIT_SECONDS:.0f} s; look whether each of them was started, and "
+            "can reach process 0 there"
         )
     if error := met.exception():
         said = typed.one_line(str(error) or type(error).__name__, most=200)

@@ -26,7 +26,7 @@ from . import devices, finite, log, order, precision, profiling
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check
 from .optimizers import make_optimizer
 
-JUDGE = "held_out_loss"
+BEST_MEASURE = "held_out_loss"
 """Measure that is lowest at the best step of a run."""
 
 
@@ -53,7 +53,7 @@ class Task(Taught, Protocol):
         ...
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
-        """Return measures on examples that are held out, JUDGE among them."""
+        """Return measures on examples that are held out, BEST_MEASURE among them."""
         ...
 
 
@@ -203,8 +203,8 @@ def _fit(
                 latest = {"loss": float(where.here(loss)), **task.evaluate(model)}
                 watch.check(step, where.here(params), **latest)
                 speed = curve.write(step, latest)
-                if not best or latest[JUDGE] < best["best"]["value"]:
-                    best, due = {"best": {"step": step, "measure": JUDGE, "value": latest[JUDGE]}}, True
+                if not best or latest[BEST_MEASURE] < best["best"]["value"]:
+                    best, due = {"best": {"step": step, "measure": BEST_MEASURE, "value": latest[BEST_MEASURE]}}, True
             if due:
                 save(step)
             if stopping:

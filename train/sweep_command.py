@@ -29,7 +29,7 @@ _TRAINING = {
     "values": typed.Maybe({str: float}),
 }
 _FORM = {"command": [str], "trainings": {str: _TRAINING}}
-_FREE = ("out", "seed", "limit", "threads", "memory", "data_parallel", "profile")
+_UNCOMPARED_OPTIONS = ("out", "seed", "limit", "threads", "memory", "data_parallel", "profile")
 """Options that differ between trainings, or on which no result depends."""
 
 
@@ -172,7 +172,7 @@ def _record(out: pathlib.Path, trainings: Sequence[Training], *, own_steps: bool
 
     first = trainings[0]
     commands: dict[str, Any] = cli.COMMANDS
-    free = (*_FREE, "steps") if own_steps else _FREE
+    free = (*_UNCOMPARED_OPTIONS, "steps") if own_steps else _UNCOMPARED_OPTIONS
     command = [first.kind, *command_line.words(commands[first.kind], first.given, without=free)]
     path = out / RECORD
     record: dict[str, Any] = {"command": command, "trainings": {}}

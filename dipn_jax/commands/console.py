@@ -28,7 +28,7 @@ from dipn_jax.system.interruption import Stopping
 if TYPE_CHECKING:
     import rich.progress
 
-MOST = 2**31 - 1
+MAX_COUNT = 2**31 - 1
 """Largest value of an option that counts something."""
 INTERRUPTED = "interrupted: run the same command again to continue from here"
 LOG_PERIOD = 10.0
@@ -149,8 +149,8 @@ def require_positive(**values: float) -> None:
     for name, value in values.items():
         if not 0 < value < float("inf"):
             raise UserError(f"{_option(name)} {value}: want a number above 0")
-        if isinstance(value, int) and value > MOST:
-            raise UserError(f"{_option(name)} {value:.3g}: want a number above 0 and at most {MOST:,}")
+        if isinstance(value, int) and value > MAX_COUNT:
+            raise UserError(f"{_option(name)} {value:.3g}: want a number above 0 and at most {MAX_COUNT:,}")
 
 
 def require_between(low: float, high: float, **values: float) -> None:

@@ -17,9 +17,9 @@ from typing import Any, Literal
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.system import addresses, machine
-from dipn_jax.system.interruption import STOPS
+from dipn_jax.system.interruption import STOP_SIGNALS
 
-AHEAD = 2
+SUBMITTED_PER_SLOT = 2
 """Tasks that are submitted for each one that the cluster can run at a time."""
 ANSWERS_WITHIN = 20.0
 """Seconds within which a cluster has to accept a connection."""
@@ -124,7 +124,7 @@ def _window(ray: Any, launch: Launch) -> int:
     """Return how many tasks are submitted at a time, so that no machine waits for one and the cluster keeps few."""
     there = ray.cluster_resources()
     asked = [(there.get("CPU", 0.0), launch.num_cpus), (there.get("GPU", 0.0), launch.num_gpus)]
-    return max(AHEAD, AHEAD * int(min(has / need for has, need in asked if need)))
+    return max(SUBMITTED_PER_SLOT, SUBMITTED_PER_SLOT * int(min(has / need for has, need in asked if need)))
 
 
 def _warn_of_too_little(ray: Any, launch: Launch) -> None:
@@ -159,7 +159,7 @@ def _connected() -> Iterator[Any]:
     if ray.is_initialized():
         yield ray
         return
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *STOPS)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *STOP_SIGNALS)}
     quiet = {"log_to_driver": False, "logging_level": "ERROR"}
     address = os.environ.get("RAY_ADDRESS")
     _require_answer(address)

@@ -14,7 +14,7 @@ import sys
 
 from dipn_jax.system import typed
 
-SETTINGS = (
+IGNORED_JAX_SETTINGS = (
     "JAX_DEFAULT_DTYPE_BITS",
     "JAX_DEFAULT_MATMUL_PRECISION",
     "JAX_DEFAULT_PRNG_IMPL",
@@ -50,7 +50,7 @@ def settle() -> str | None:
         os.environ["MUJOCO_GL"] = "disable"
     if "jax" in sys.modules:
         return None
-    there = {name: os.environ.pop(name) for name in SETTINGS if name in os.environ}
+    there = {name: os.environ.pop(name) for name in IGNORED_JAX_SETTINGS if name in os.environ}
     return f"{_shown(there)}: ignored, because results would differ or fail" if there else None
 
 

@@ -73,7 +73,7 @@ class Worlds:
     def load(self, scenes: Scene) -> None:
         """Put other scenes of the same number and slots into the model."""
         self.scenes = scenes
-        kind, size = warp_model.kinds(scenes), np.repeat(scenes.size, shapes.PARTS, 1)
+        kind, size = warp_model.kinds(scenes), np.repeat(scenes.size, shapes.CONVEX_PARTS, 1)
         warp_model.put(self.warp, self.model, warp_model.mesh_fields(kind, size))
         warp_model.put(self.warp, self.model, warp_model.scene_fields(self.spec, scenes, kind, size))
         self.mass.assign(np.where(scenes.shape >= 0, scenes.mass, 0.0).astype(np.float64))

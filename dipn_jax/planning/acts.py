@@ -43,7 +43,9 @@ def decide_by_imagining(
     return decide
 
 
-def decide_by_values(push_scorer: Scorer, scorer: Scorer, network_scores: Scorer, *, grasp_at_once: bool) -> DecideFunction:
+def decide_by_values(
+    push_scorer: Scorer, scorer: Scorer, network_scores: Scorer, *, grasp_at_once: bool
+) -> DecideFunction:
     """Return the function that compares the best push and the best grasp by value; pushes go the first distance.
 
     Args:

@@ -252,7 +252,7 @@ def _part(run: pathlib.Path, name: str, aids: tuple[Aid, ...] = ()) -> Scorer:
     Raises:
       UserError: it was trained without.
     """
-    if (found := scorers.load_values(run, aids=aids)[vpg.PARTS.index(name)]) is None:
+    if (found := scorers.load_values(run, aids=aids)[vpg.NETWORK_PARTS.index(name)]) is None:
         raise UserError(f"--value-net {run}: was not trained to {name}; give a run of another --method")
     return found
 

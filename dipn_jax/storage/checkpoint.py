@@ -27,7 +27,7 @@ from dipn_jax.networks import dipn, grasp, vpg
 from dipn_jax.storage import leaves, owner, quiet, stored_step
 from dipn_jax.system import files, forking, temporary, typed
 
-WANTED = (
+ACCEPTED_RUNS_TEXT = (
     "give a run (the --out of dipn-train), one step of it (RUN@STEP, RUN@best) or that step's folder "
     "(RUN/checkpoints/STEP)"
 )
@@ -278,10 +278,10 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     forking.check()
     run = find(files.not_empty(run), network=network)
     if not run.is_dir():
-        raise UserError(f"checkpoint {run}: no such folder; {WANTED}")
+        raise UserError(f"checkpoint {run}: no such folder; {ACCEPTED_RUNS_TEXT}")
     found = newest(run)
     if found is None:
-        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; {WANTED}, or train again")
+        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; {ACCEPTED_RUNS_TEXT}, or train again")
     folder, meta = found
     if meta["network"] != network:
         raise UserError(f"checkpoint {run}: holds a {meta['network']} network, want {network}; give another run")

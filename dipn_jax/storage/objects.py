@@ -15,7 +15,7 @@ from typing import Any
 from dipn_jax.errors import UserError
 from dipn_jax.system import typed
 
-SETTINGS = {
+CREDENTIAL_VARIABLES = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_REGION; elsewhere than at Amazon AWS_ENDPOINT, too",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS",
     "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
@@ -28,7 +28,7 @@ FIRST_RETRIES = {"max_retries": 1, "retry_timeout": datetime.timedelta(seconds=2
 """
 NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")
 """Parts of the answers where there is no bucket."""
-MOST_SAID = 200
+MAX_MESSAGE_CHARS = 200
 """Characters of a reason that are shown at most."""
 
 
@@ -127,13 +127,13 @@ class Bucket:
         answer = re.search("<Message>([^<]+)", text)
         first = answer[1] if answer else text.strip().split("\n")[0]
         if self.scheme == "file":
-            return f"cannot be used ({typed.one_line(first, most=MOST_SAID)}); give another folder"
+            return f"cannot be used ({typed.one_line(first, most=MAX_MESSAGE_CHARS)}); give another folder"
         if isinstance(error, FileNotFoundError) or any(part in text for part in NO_BUCKET):
             return "no such bucket; make it, or give another"
-        needs = f"the environment has to say {SETTINGS[self.scheme]}"
+        needs = f"the environment has to say {CREDENTIAL_VARIABLES[self.scheme]}"
         if any(part in text for part in NO_CREDENTIALS):
             return f"no credentials; {needs}"
-        return f"cannot be used ({typed.one_line(first, most=MOST_SAID)}); {needs}"
+        return f"cannot be used ({typed.one_line(first, most=MAX_MESSAGE_CHARS)}); {needs}"
 
 
 def _opened(url: str, *, make: bool, **options: Any) -> Any:

@@ -117,7 +117,7 @@ class Objects:
 
     def note(self, command: Sequence[str], *, of: int) -> None:
         accounting.note(self.folder, command, of=of)
-        self._bucket.put(accounting.ASKED, files.read_bytes(self.folder / accounting.ASKED))
+        self._bucket.put(accounting.REQUEST_FILE, files.read_bytes(self.folder / accounting.REQUEST_FILE))
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
         """As `Place.counts`: shards that the manifest does not list are fetched to be looked at."""
@@ -130,7 +130,7 @@ class Objects:
         todo = [name for name in names.values() if name not in self._entries]
         with (
             console.Progress("look", len(todo), unit="shards", quiet=len(todo) < SILENT_SHARDS) as progress,
-            concurrent.futures.ThreadPoolExecutor(mirror.AT_ONCE) as pool,
+            concurrent.futures.ThreadPoolExecutor(mirror.PARALLEL_FETCHES) as pool,
         ):
             for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
                 self._entries |= {name: entry} if entry else {}

@@ -25,7 +25,7 @@ FORM = {
     "best?": {"step": typed.Whole(), "measure": str, "value": float},
 }
 """Form of `meta.json`; `best` says at which step of the run so far a measure was lowest, that step included."""
-LARGEST = 65_536
+MAX_CONFIG_NUMBER = 65_536
 """Largest number in a network's config."""
 
 
@@ -50,7 +50,7 @@ def _form(default: Any) -> typed.Form:
     """Return the form of an option whose default is this."""
     if isinstance(default, tuple):
         return [_form(default[0])]
-    return typed.Whole(1, LARGEST) if type(default) is int else type(default)
+    return typed.Whole(1, MAX_CONFIG_NUMBER) if type(default) is int else type(default)
 
 
 _COUNTS_OF_LAYERS = ("stages", "blocks", "rounds")

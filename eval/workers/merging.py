@@ -95,8 +95,9 @@ def check(parts: Sequence[Part]) -> None:
             raise UserError(f"{one} and {part.folder}: both are shard {part.shard} of {part.of}; give each part once")
         found[part.shard] = part
     if missing := sorted(set(range(first.of)) - set(found)):
-        named = ", ".join(map(str, missing[: accounting.MOST_NAMED]))
-        more = f" and {len(missing) - accounting.MOST_NAMED} more" if len(missing) > accounting.MOST_NAMED else ""
+        unnamed = len(missing) - accounting.MAX_SHARDS_NAMED
+        named = ", ".join(map(str, missing[: accounting.MAX_SHARDS_NAMED]))
+        more = f" and {unnamed} more" if unnamed > 0 else ""
         which = f"shard{'s' if len(missing) > 1 else ''} {named}{more} of {first.of}"
         raise UserError(f"{which} missing: run {_run(first, missing[0])}")
 
