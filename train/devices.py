@@ -177,8 +177,8 @@ def _in_time(meet: Callable[[], None], given: str) -> None:
         concurrent.futures.wait([met], timeout=WAIT_LIMIT_SECONDS - WAIT_NOTICE_SECONDS)
     if not met.done():
         raise UserError(
-            f"{given}: not all processes came within {WAIT_LIMIT_SECONDS:.0f} s; look whether each of them was started, and "
-            "can reach process 0 there"
+            f"{given}: not all processes came within {WAIT_LIMIT_SECONDS:.0f} s; look whether each of them was "
+            "started, and can reach process 0 there"
         )
     if error := met.exception():
         said = typed.one_line(str(error) or type(error).__name__, most=200)

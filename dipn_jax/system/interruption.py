@@ -13,7 +13,7 @@ STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SI
 
 
 def stops() -> list[signal.Signals]:
-    """Return the signals of STOP_SIGNALS that are heeded: all but those that are ignored because `nohup` asked for it."""
+    """Return the signals of STOP_SIGNALS that are heeded: all but those that are ignored, as `nohup` asks."""
     return [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
 
 
