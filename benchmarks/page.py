@@ -91,7 +91,7 @@ OTHERS = ("torch", "pybullet")
 
 
 def origins(kept: dict[str, Any]) -> str:
-    """Machines, commits, versions and seeds behind the figures of a file, as a Markdown table with a row for each.
+    """Return the machines, commits, versions and seeds behind the figures of a file, as a Markdown table, a row each.
 
     Args:
       kept: what a file of `--out` holds, or several merged by hand, where `machine` is a list and says its `rows`.

@@ -1,4 +1,4 @@
-"""What runs promise: each with the tests that fail where it is broken, and what was counted of it."""
+"""The promises of commands, each with the tests that fail where it is broken, and with the counts for it."""
 
 from __future__ import annotations
 

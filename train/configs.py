@@ -71,7 +71,7 @@ class Compute:
 
     data_parallel: bool = False
     """Share each batch among all devices: of this machine, or of all processes of the job. What is learnt is the same
-    but for rounding, and a run may go on with another number of devices."""
+    but for rounding, and a run may continue with another number of devices."""
     accumulate: int = 1
     """Parts that each batch is computed in, one after another, for less memory. The gradient is the mean of theirs, and
     each has its own statistics and random numbers."""

@@ -28,7 +28,7 @@ WAIT_NOTICE_SECONDS = 10
 
 
 class OneDevice:
-    """Steps on the device that JAX takes unless told otherwise."""
+    """Steps on JAX's default device."""
 
     leads = True
     """Whether this process writes the run's folder, and says how far it is."""
@@ -50,7 +50,7 @@ class OneDevice:
         return tree
 
     def any_says(self, said: bool, step: int) -> bool:
-        """Return whether a process says so; asked after every step, by all processes, answered after some."""
+        """Return whether any process wants to stop; all call it after each step and agree every SYNC_EVERY steps."""
         return said
 
     def wait(self, name: str) -> None:

@@ -40,7 +40,7 @@ class Log:
     """
 
     def __init__(self, out: pathlib.Path, begin: int, *, batch: int, writes: bool = True) -> None:
-        """Open the files of a run that goes on after step `begin`, if this process `writes` them."""
+        """Open the files of a run that continues after step `begin`, if this process `writes` them."""
         self.path, self._batch, self._at = out / "metrics.jsonl", batch, (begin, time.monotonic())
         self._events: tensorboardX.SummaryWriter | None = None
         if writes:

@@ -30,15 +30,15 @@ BEST_MEASURE = "held_out_loss"
 """Measure that is lowest at the best step of a run."""
 
 
-class Taught(Protocol):
-    """The part of a task that an optimizer step needs."""
+class LossTask(Protocol):
+    """Something with a loss; all that `make_step` needs of a task."""
 
     def loss(self, model: nnx.Module, batch: Any, key: jax.Array) -> jax.Array:
         """Return the loss of a batch of examples, inside jit."""
         ...
 
 
-class Task(Taught, Protocol):
+class Task(LossTask, Protocol):
     """Something to learn: data, a loss and a measure."""
 
     network: str  # key of checkpoint.NETWORKS
@@ -64,7 +64,7 @@ def _split(model: nnx.Module) -> tuple[Any, Any, Any]:
 
 
 def make_step(
-    task: Taught, graph: Any, optimizer: optax.GradientTransformation, *, compute: Compute = DEFAULT_COMPUTE
+    task: LossTask, graph: Any, optimizer: optax.GradientTransformation, *, compute: Compute = DEFAULT_COMPUTE
 ) -> Callable[..., Any]:
     """Return the jitted step `(params, rest, moments, batch, key) -> (params, rest, moments, loss)`.
 

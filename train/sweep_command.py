@@ -128,7 +128,7 @@ def plan(
 
 
 def _check_steps(command: Sequence[str], *, limits: Sequence[int], steps: Sequence[int]) -> None:
-    """Return if there are steps for every limit, or none at all.
+    """Raise an error unless there are steps for every limit, or none at all.
 
     Raises:
       UserError: there are not, one is below 1, or the command says how many, too.
@@ -161,7 +161,7 @@ def _parsed(command: Sequence[str], out: pathlib.Path) -> tuple[str, dict[str, A
 
 
 def _record(out: pathlib.Path, trainings: Sequence[Training], *, own_steps: bool) -> dict[str, Any]:
-    """Return the content of `sweep.json` with all trainings in it, those that are there with what they measured.
+    """Return the content of `sweep.json`: all trainings, those in the present file with what they measured.
 
     Where each limit has its own steps (`own_steps`), one that made another number of them has measured nothing yet.
 

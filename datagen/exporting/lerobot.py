@@ -56,7 +56,7 @@ class LeRobot:
         return self.out / what / f"chunk-{folder:03d}" / f"file-{file:03d}.parquet"
 
     def done(self, part: Part) -> bool:
-        """Return whether a part has been written; its episodes are, after its frames."""
+        """Return whether a part has been written: its file of episodes is written after that of frames."""
         return self._path("meta/episodes", part.place).exists()
 
     def write(self, part: Part, blocks: Iterator[Values]) -> None:

@@ -58,9 +58,9 @@ def enable_compilation_cache() -> None:
 
 
 def prepare() -> None:
-    """Make streams, environment and cache what commands need; one line says which settings of JAX are ignored."""
+    """Prepare streams, environment and compilation cache for a command; warn of ignored JAX settings in one line."""
     surroundings.open_streams()
-    if ignored := surroundings.settle():
+    if ignored := surroundings.set_environment():
         warn(ignored)
     enable_compilation_cache()
 
@@ -145,7 +145,7 @@ def warn(text: str) -> None:
 
 
 def require_positive(**values: float) -> None:
-    """Raise a UserError for the first value that is no finite number above zero, or counts more than work that ends."""
+    """Raise a UserError for the first value that is no finite number above zero, or is a count over MAX_COUNT."""
     for name, value in values.items():
         if not 0 < value < float("inf"):
             raise UserError(f"{_option(name)} {value}: want a number above 0")

@@ -25,7 +25,7 @@ from dipn_jax.world.scenes import parked
 
 
 def _adapt(spec: mujoco.MjModel) -> None:
-    """Change what the MJCF says that would cost MJX time and gain nothing."""
+    """Change settings of the MJCF that would cost MJX time without any gain."""
     # MJX keeps `contact_points` rows for each condim: with the pads at 4 the solver has 2.5 times the rows and a step
     # takes 1.6 times as long, for a torsional friction that the several contacts of a pad have without it
     spec.geom_condim[spec.geom_condim == 4] = 3

@@ -37,7 +37,7 @@ with 2,048 (docs/benchmarks.md); more were not tried."""
 
 
 class Room(NamedTuple):
-    """How much there is room for, times the objects of the fullest scene and the gripper.
+    """Room in memory for each object of the fullest scene, and as much for the gripper.
 
     All scenes of a batch share their contacts and pairs; each has its own rows. Seen (`python -m benchmarks
     engines.warp_room`): at most 13 contacts, 2.5 pairs and 44 rows with one object, which a grasp presses on the

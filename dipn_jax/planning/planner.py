@@ -154,7 +154,7 @@ def decide_among(
 
 
 def _drawn(motion: Float[Array, "*b 3"], rule: Rule) -> Float[jax.Array, "*b 3"]:
-    """Return motions as they are drawn: small ones are none, unless the rule says otherwise."""
+    """Return motions as they are drawn: small ones are 0, unless the rule has `draw_all`."""
     small = jnp.linalg.norm(motion[..., :2], axis=-1) < UNDRAWN_SHIFT
     small &= jnp.abs(motion[..., 2]) < UNDRAWN_TURN
     return jnp.where(small[..., None] & ~jnp.asarray(rule.draw_all), 0.0, motion)

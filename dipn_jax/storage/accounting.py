@@ -27,7 +27,7 @@ NOT_RECORDED = "not recorded"
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """What was asked for: shards of `shard_size` episodes, the last one of what is left."""
+    """Requested size of a data set; the last shard may be shorter."""
 
     episodes: int
     shard_size: int
@@ -59,7 +59,7 @@ def command(folder: pathlib.Path) -> list[str] | None:
 
 
 def asked(folder: pathlib.Path) -> Asked | None:
-    """Return what was asked for of a data set; None where its folder does not say it.
+    """Return the requested size of a data set; None where its folder does not say it.
 
     Raises:
       UserError: its configuration is damaged.

@@ -70,7 +70,7 @@ def _copied(url: str) -> pathlib.Path:
     """Make the copy the same as what is at the URL, and return its folder."""
     bucket, folder = Bucket(url), folder_of(url)
     folder.mkdir(parents=True, exist_ok=True)
-    addresses.call(folder, url)
+    addresses.show_instead(folder, url)
     with _turn(folder):
         described = {name: found for name, found in bucket.list().items() if not _is_shard(name)}
         _fetch(bucket, folder, described)
@@ -90,7 +90,7 @@ def _is_shard(name: str) -> bool:
 
 
 def _fetch(bucket: Bucket, folder: pathlib.Path, there: Mapping[str, Found]) -> None:
-    """Fetch the objects of a data set that the copy does not have as they are."""
+    """Fetch the objects of a data set that the copy lacks, or has in another version."""
     known = _known(folder)
     wanted = [name for name in there if _is_shard(name) or name in (CONFIG, REQUEST_FILE, MANIFEST)]
     todo = [name for name in wanted if not _has(folder / name, known.get(name), there[name])]

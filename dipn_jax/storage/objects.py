@@ -44,7 +44,7 @@ class Bucket:
     """What is below a URL. Threads may share it, forked processes may not."""
 
     def __init__(self, url: str, *, make: bool = False) -> None:
-        """Look whether it can be listed.
+        """Open what is below a URL, and check that it can be listed.
 
         Args:
           url: from `addresses.url`.
@@ -81,7 +81,7 @@ class Bucket:
         return None
 
     def create(self, name: str, data: bytes) -> bool:
-        """Write an object where there is none of that name, and return whether that was so: one writer wins."""
+        """Write an object unless there is one of that name; return whether it was written, so that one writer wins."""
         import obstore
 
         with self._said():
@@ -92,7 +92,7 @@ class Bucket:
         return True
 
     def put(self, name: str, data: bytes) -> None:
-        """Write an object, whatever was there of that name."""
+        """Write an object; one of that name is replaced."""
         import obstore
 
         with self._said():
@@ -113,7 +113,7 @@ class Bucket:
 
     @contextlib.contextmanager
     def _said(self) -> Iterator[None]:
-        """Turn whatever storage refuses into one line."""
+        """Turn any error of the storage into a UserError of one line."""
         import obstore
 
         try:
@@ -122,7 +122,7 @@ class Bucket:
             raise UserError(f"{self.url}: {self._why(error)}") from None
 
     def _why(self, error: Exception) -> str:
-        """Return what is wrong, and what to do."""
+        """Return what is wrong with the storage, and what to do."""
         text = str(error)
         answer = re.search("<Message>([^<]+)", text)
         first = answer[1] if answer else text.strip().split("\n")[0]

@@ -164,7 +164,7 @@ class Objects:
             (self.folder / name).unlink(missing_ok=True)
 
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
-        """As `Place.list`; of workers that end at the same time, the last one's counts, and readers find the rest."""
+        """As `Place.list`; if workers end at the same time, the last manifest stays; readers find the other shards."""
         known = self._listed() | self._entries | dict(made)
         there = self._bucket.list()
         held = {name: known[name] for name in there if name in known and known[name]["bytes"] == there[name].size}
@@ -216,7 +216,7 @@ def opened(out: pathlib.Path) -> Iterator[Place]:
         yield Folder(out)
         return
     with tempfile.TemporaryDirectory(prefix="dipn-datagen-") as folder:
-        addresses.call(pathlib.Path(folder), url)
+        addresses.show_instead(pathlib.Path(folder), url)
         yield Objects(url, pathlib.Path(folder))
 
 

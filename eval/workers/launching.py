@@ -63,7 +63,7 @@ def place(out: pathlib.Path, share: Share) -> pathlib.Path:
 
 
 def make_part(kind: str, given: dict[str, Any]) -> None:
-    """Make a part by the command that makes it alone; a task, which may have been tried before, or run twice.
+    """Make a part by the command that makes it alone. Runs as a Ray task, so it may be retried, or run twice.
 
     It works in a folder of its own, which gets the part's name at the end, unless another did that meanwhile.
 

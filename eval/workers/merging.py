@@ -79,7 +79,7 @@ def _merger(kind: str) -> Callable[[Sequence[Part], pathlib.Path], dict[str, Any
 
 
 def check(parts: Sequence[Part]) -> None:
-    """Return if the parts are all of one evaluation, each once.
+    """Raise an error unless the parts are all of one evaluation, each once.
 
     Raises:
       UserError: they are not; it says which differ in what, which is there twice, or which is missing.
@@ -103,7 +103,7 @@ def check(parts: Sequence[Part]) -> None:
 
 
 def _difference(one: Part, other: Part) -> str:
-    """Return in what two parts differ, so that they are of different evaluations; an empty text if in nothing."""
+    """Return the difference that makes two parts of different evaluations; an empty text if there is none."""
     if one.kind != other.kind:
         return f"parts of dipn-eval {one.kind} and of dipn-eval {other.kind}"
     for key in sorted({*one.named, *other.named}):
