@@ -277,6 +277,6 @@ def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig, *, 
     files.claim(out, identity | {"steps": begun}, write=write)
     if begun != config.steps:
         raise UserError(
-            f"{out}: its learning rate is planned for --steps {begun}, so that it cannot go on to {config.steps}; give "
-            f"--init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
+            f"{out}: its learning rate is planned for --steps {begun}, so that it cannot continue to {config.steps}; "
+            f"give --init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
         )

@@ -63,7 +63,12 @@ def last(run: pathlib.Path) -> Values:
 
 
 def train(kind: str, given: dict[str, Any]) -> Values:
-    """Train, or continue a training, and return its last measurements. Runs as a Ray task, so it may be retried."""
+    """Train, or continue a training, and return its last measurements. Runs as a Ray task, so it may be retried.
+
+    Args:
+      kind: command of dipn-train.
+      given: its options by name, as its function takes them; a dictionary, because each command has its own options.
+    """
     from . import cli
 
     commands: dict[str, Any] = cli.COMMANDS

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 MAX_COUNT = 2**31 - 1
 """Largest value of an option that counts something."""
 INTERRUPTED = "interrupted: run the same command again to continue from here"
+"""What a command that was interrupted prints at its end."""
 LOG_PERIOD = 10.0
 """Seconds between progress lines where there is no terminal."""
 

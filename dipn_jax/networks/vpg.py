@@ -24,12 +24,12 @@ GROWTH_RATE = 32
 class VpgConfig:
     """Architecture. `paper`: two DenseNet-121 trunks a primitive; `compact`: GN's trunk for each."""
 
-    preset: str = "compact"
+    preset: str = "compact"  # or paper
     parts: tuple[str, ...] = NETWORK_PARTS
     answers: str = "value"  # or chance: a probability
     blocks: tuple[int, ...] = (6, 12, 24, 16)  # paper: DenseNet-121
     width: int = 24  # compact: as GraspConfig
-    coarse: int = 48
+    coarse: int = 48  # compact: as GraspConfig
 
     def __post_init__(self) -> None:
         if self.preset not in ("paper", "compact"):

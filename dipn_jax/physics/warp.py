@@ -44,7 +44,7 @@ class Room(NamedTuple):
     table, and 8.8, 1.3 and 30 with three and more.
     """
 
-    contacts: int = 16
+    contacts: int = 16  # between any two geoms, the table and the gripper included
     pairs: int = 4  # of convex parts that touch, the table not counted
     rows: int = 64  # of constraints: three a contact
 

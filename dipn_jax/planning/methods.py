@@ -27,6 +27,7 @@ from dipn_jax.structs import Array, Decision, Observation
 from dipn_jax.system import forking
 
 NetworkRole = Literal["push", "grasp", "value"]
+"""What a network does in a method: predict pushes (DIPN), score grasps (GN), or value actions (compared methods)."""
 ROLES: dict[NetworkRole, tuple[str, str]] = {
     "push": ("dipn", "push"),
     "grasp": ("grasp", "grasp"),

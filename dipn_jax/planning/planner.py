@@ -45,6 +45,8 @@ class Rule(Pytree):
     """How Alg. 2 decides; every field is traced. The defaults are the paper's rule.
 
     Example:
+      from dipn_jax.planning.planner import Rule
+
       decision = dipn_jax.decide(key, observation, predictor, scorer, rule=Rule(gamma=0.8))
     """
 
@@ -55,10 +57,10 @@ class Rule(Pytree):
     edge_factor: Float[Array, ""] | float = 1.0
     draw_all: Bool[Array, ""] | bool = False  # draw also motions below UNDRAWN_SHIFT and UNDRAWN_TURN
     top_margin: Float[Array, ""] | float = 0.0  # see `candidates.grasp_from_top`
-    # clauses that only DIPN's released code has
-    grasp_lone: Bool[Array, ""] | bool = False  # a lone object is grasped
-    push_must_raise_best: Bool[Array, ""] | bool = False  # a push must raise the best score, too
-    # gamma discounts only pushes after which the best score is higher (released: 0.5)
+    grasp_lone: Bool[Array, ""] | bool = False  # released code only: a lone object is grasped
+    # released code only: a push must raise the best score, too
+    push_must_raise_best: Bool[Array, ""] | bool = False
+    # released code only (0.5): gamma discounts only pushes after which the best score is higher than this
     discount_above: Float[Array, ""] | float = 0.0
 
 

@@ -30,8 +30,8 @@ class PolicyConfig:
 
     candidates: int = 32  # pushes considered at a time
     distances: tuple[float, ...] = (0.10,)  # metres a push goes; of several, candidates take them in turn
-    gamma: float = 0.9
-    grasp_above: float = 0.7
+    gamma: float = 0.9  # discount of a push's value
+    grasp_above: float = 0.7  # grasp at once if the best score is higher
     released: bool = False  # with the clauses of DIPN's released code
     aids: tuple[Aid, ...] = ALL_AIDS  # small rules of ours; the caller gives `memory` the misses
 

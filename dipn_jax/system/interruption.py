@@ -24,8 +24,8 @@ AGAIN_AFTER = 0.05
 class Stopping:
     """A context in which SIGINT and the signals of STOP_SIGNALS raise KeyboardInterrupt.
 
-    Where it is raised within a callback, as JAX has one at each garbage collection, Python prints it and goes on: then
-    the signal is sent again instead. Handlers stay in place at the end.
+    Where it is raised within a callback, as JAX has one at each garbage collection, Python prints it and
+    continues: then the signal is sent again instead. Handlers stay in place at the end.
     """
 
     def __init__(self) -> None:

@@ -35,7 +35,7 @@ FORMS = {
     "single_label": Form("b", ("S",)),  # what pre-training says of it
     "single_held": Form("b", ("S",)),
 }
-"""Arrays of what was tried; the first of each kind numbers its table or scene, by which they are in order."""
+"""Arrays of what was tried; the first of each kind has the table or scene of each grasp, in order of which they are."""
 BINS = 10
 """Number of bins of scores."""
 

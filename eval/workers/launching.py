@@ -69,7 +69,8 @@ def make_part(kind: str, given: dict[str, Any]) -> None:
 
     Args:
       kind: command of dipn-eval.
-      given: its options by name, as its function takes them; a dictionary, because each command has its own.
+      given: its options by name, as its function takes them; a dictionary, because each command has its own
+        options.
     """
     from .. import cli
 
