@@ -9,6 +9,7 @@ import inspect
 import itertools
 import os
 import pathlib
+import re
 import signal
 import sys
 import threading
@@ -16,7 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_type_hints
 
 import tyro
 
@@ -195,6 +196,17 @@ def _described(command: Callable[..., Any], *, whole: bool) -> str:
     return result
 
 
+def _joined(command: Callable[..., Any]) -> Any:
+    """Return `command` with each option's text on one line of its docstring: tyro would keep the line ends in it."""
+    called: Any = option_paths.absolute(command)
+    text, head, options = inspect.cleandoc(command.__doc__ or "").partition("\nArgs:\n")
+    called.__doc__ = text + head + re.sub(r"\n {4,}", " ", options)
+    called.__signature__ = inspect.signature(command)
+    called.__annotations__ = get_type_hints(inspect.unwrap(command), include_extras=True)
+    del called.__wrapped__  # there tyro would read the docstring that is not joined
+    return called
+
+
 def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and call one of `commands`.
 
@@ -265,7 +277,7 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
             Any,
             tyro.conf.subcommand(
                 name,
-                constructor=option_paths.absolute(command),
+                constructor=_joined(command),
                 description=_described(command, whole=name in arguments[:1]),
             ),
         ]
