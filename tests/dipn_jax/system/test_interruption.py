@@ -24,7 +24,7 @@ def _handlers() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", ALL)
-def test_a_signal_lets_the_present_step_end_and_the_command_ends_as_interrupted(number: signal.Signals) -> None:
+def test_a_signal_lets_the_current_step_end_and_interrupts_the_command(number: signal.Signals) -> None:
     done = []
 
     def work() -> None:
