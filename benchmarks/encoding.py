@@ -1,4 +1,4 @@
-"""What a data set costs besides physics: writing episodes that are there already, and all else around a simulation."""
+"""What a data set costs besides physics: encoding and writing episodes, and everything around a simulation."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def real(objects: int, count: int, seed: int) -> PushEpisode:
 
 
 def synthetic(made: PushEpisode, count: int, seed: int) -> PushEpisode:
-    """Return `count` push episodes: those of `made` again and again, each time at another place.
+    """Return `count` push episodes: copies of those of `made`, each at another place.
 
     All poses of an episode move alike, so what rests in it still rests, and compresses as it does in a real one.
     """
@@ -91,7 +91,7 @@ class Resting:
 
 
 def writing_rate(objects: int, episodes: int, *, shards: int, few: int, seed: int) -> float:
-    """Measure the push episodes a second that are encoded and written, of `few` real ones again and again."""
+    """Measure how many push episodes a second are encoded and written; they are copies of `few` real ones."""
     made = synthetic(real(objects, few, seed), episodes, seed)
     task = job(objects, episodes, shards=shards, seed=seed)
     with mock.patch.object(generate, "shard", lambda *_: (made, {})):
@@ -100,7 +100,7 @@ def writing_rate(objects: int, episodes: int, *, shards: int, few: int, seed: in
 
 
 def reading_rate(objects: int, episodes: int, *, shards: int, few: int, seed: int) -> float:
-    """Measure the push episodes a second that a training reads, checks and decodes, of files just written."""
+    """Measure how many push episodes a second a training reads, checks and decodes from files just written."""
     made = synthetic(real(objects, few, seed), episodes, seed)
     task = job(objects, episodes, shards=shards, seed=seed)
     with tempfile.TemporaryDirectory() as name, quiet(), mock.patch.object(generate, "shard", lambda *_: (made, {})):
@@ -116,7 +116,7 @@ def make_without_physics(task: generate.Job) -> int:
 
 
 def pipeline_rate(objects: int, episodes: int, *, shards: int, seed: int) -> float:
-    """Measure the push episodes a second on disk, drawing, rendering and aiming included, with `Resting` as engine."""
+    """Measure push episodes a second on disk, with drawing, rendering and aiming, with `Resting` as engine."""
     task = job(objects, episodes, shards=shards, seed=seed)
     make_without_physics(task)  # compiles
     return task.episodes / seconds(lambda: make_without_physics(task))

@@ -1,4 +1,4 @@
-"""What it costs a training that its examples are in files: the compact DIPN with examples in memory, and in files."""
+"""The cost of keeping a training's examples in files: the compact DIPN with examples in memory, and in files."""
 
 from __future__ import annotations
 

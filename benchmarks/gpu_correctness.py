@@ -1,4 +1,4 @@
-"""Stages of `on_gpu` that say whether it is right: shipped networks, engines against MuJoCo C, the same run twice."""
+"""Stages of `on_gpu` that check results: shipped networks, engines against MuJoCo C, the same run twice."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def table_slots() -> int:
 
 
 def recall_nothing(heights: Any) -> np.ndarray:
-    """Return that no grasp has missed, for tables that look so `[B, H, W]`: a memory for `policy`."""
+    """Return an empty memory of misses for these height maps `[B, H, W]`."""
     return np.repeat(NONE_MISSED[None], len(heights), 0)
 
 
@@ -71,7 +71,7 @@ def weights(size: Size) -> Found:
 
 
 def check_scores(decision: Decision) -> None:
-    """Raise `Wrong` where the score of a table's best grasp is not one."""
+    """Raise `Wrong` where the score of a table's best grasp is not in [0, 1]."""
     score = np.asarray(decision.grasp_score)
     if not ((score >= 0) & (score <= 1)).all():
         raise Wrong(f"scores of grasps from {score.min():g} to {score.max():g}; want 0 to 1")

@@ -23,7 +23,7 @@ class Worker:
     """The process that measures; see `gpu_stage`. Its children are in its group and end with it."""
 
     def __init__(self) -> None:
-        """Start it."""
+        """Start the process."""
         # the device's memory is shared with processes of other frameworks
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | os.environ
         self.process = subprocess.Popen(
@@ -46,14 +46,14 @@ class Worker:
         self._answers.put("")
 
     def ask(self, request: dict[str, Any]) -> None:
-        """Send a stage; a process that is dead says so when it is asked for an answer."""
+        """Send a stage to the process; if the process has ended, `answers` says so."""
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self.process.stdin.write(json.dumps(request) + "\n")
             self.process.stdin.flush()
 
     def answers(self, until: float) -> Iterator[dict[str, Any]]:
-        """Return what it answers, up to the end of a stage.
+        """Yield the answers of the process, up to the end of a stage.
 
         Args:
           until: instant of the monotonic clock.

@@ -39,7 +39,7 @@ class Record:
     """The file: figures, lines of text, how each stage ended, and on which machines."""
 
     def __init__(self, path: pathlib.Path, *, scale: str, seed: int) -> None:
-        """Take over what is in the file.
+        """Read what an earlier run has left in the file.
 
         Raises:
           UserError: it is something else, or of another scale or seed.
@@ -60,14 +60,14 @@ class Record:
         return bool(self.kept["stages"].get(stage, {}).get("state") == MEASURED)
 
     def forget(self, stage: str) -> None:
-        """Take out what a stage measured that is measured anew."""
+        """Remove the figures and lines of a stage, which is measured again."""
         for part in ("figures", "notes"):
             old = self.kept[part]
             self.kept[part] = {name: old[name] for name in old if name != stage and not name.startswith(f"{stage}/")}
         self.kept["stages"].pop(stage, None)
 
     def note(self, answer: dict[str, Any]) -> None:
-        """Take a figure or a line of text, and show it."""
+        """Record a figure or a line of text, and print it."""
         if "figure" in answer:
             self.kept["figures"][answer["figure"]] = answer["value"]
             console.say(f"{answer['figure']} {answer['value']:.4g}")

@@ -145,7 +145,7 @@ class Compiling:
             self._spans.append((begun, time.monotonic()))
 
     def taken(self) -> float:
-        """Return the seconds since the last call; what went on at the same time is counted once."""
+        """Return the seconds of compiling since the last call; simultaneous compilations count once."""
         total, end = 0.0, -np.inf
         for first, last in sorted(self._spans):
             total += max(0.0, last - max(first, end))
@@ -159,7 +159,7 @@ COMPILING = Compiling()
 
 
 def measure(request: dict[str, Any], say: Callable[[dict[str, Any]], None]) -> str:
-    """Measure a stage as far as its time allows, saying each figure; return how it ended."""
+    """Measure a stage as far as its time allows, passing each figure to `say`; return how it ended."""
     module, _, name = request["place"].partition(":")
     begun = time.monotonic()
     try:
@@ -185,7 +185,7 @@ def measure(request: dict[str, Any], say: Callable[[dict[str, Any]], None]) -> s
 
 
 def brief(error: Exception) -> str:
-    """Return what an error says, in one line of at most 300 characters; with its type, unless it is a `Wrong`."""
+    """Return an error's message in one line of at most 300 characters; with its type, unless it is a `Wrong`."""
     said = " ".join(str(error).split())[:300]
     return said if isinstance(error, Wrong) else f"{type(error).__name__}: {said}".rstrip(": ")
 

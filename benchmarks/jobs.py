@@ -45,7 +45,7 @@ def make_shard(*arguments: Any) -> tuple[str, dict[str, Any]]:
 
 
 def _do_nothing(index: int) -> int:
-    """Return the number of a task: one that costs nothing but its launch."""
+    """Return the task's number: a task that costs only its launch."""
     return index
 
 

@@ -1,7 +1,7 @@
 """`python -m benchmarks.on_gpu --out FILE.json`: what matters on a machine with a GPU, in ten minutes at most.
 
 The stages run one after another, the most important first, in a process beside this one. A stage that fails, dies or
-takes too long is one line of the file and of the table, and the others go on. The file is written after every stage;
+takes too long is one line of the file and of the table, and the others continue. The file is written after every stage;
 the same command again measures what is missing in it. `--toy` rehearses everything on a CPU, as small as it can be.
 """
 

@@ -13,10 +13,10 @@ from benchmarks.harness import Figures
 from dipn_jax.commands import console, markdown
 from dipn_jax.system import files
 
-SETTINGS = "datagen_mjx.settings"
+SETTINGS_BENCHMARK = "datagen_mjx.settings"
 """The benchmark of other settings of MJX."""
 COLUMNS = ("time", "p50_mm", "p90_mm", "grasps_equal", "faults")
-"""Columns of its table."""
+"""Columns of the table of SETTINGS_BENCHMARK."""
 
 
 def _goals() -> dict[str, str]:
@@ -67,7 +67,7 @@ def tables(figures: Figures) -> str:
     variants: dict[str, dict[str, float]] = {}
     for name, value in figures.items():
         base = _base(name, goals)
-        if base == SETTINGS:
+        if base == SETTINGS_BENCHMARK:
             _, variant, key = name.split("/")
             variants.setdefault(variant, {})[key] = value
         elif base.startswith("rates."):
@@ -91,7 +91,7 @@ OTHERS = ("torch", "pybullet")
 
 
 def origins(kept: dict[str, Any]) -> str:
-    """Machines, commits, versions and seeds behind the figures of a file, as a Markdown table with a row for each.
+    """Return the machines, commits, versions and seeds behind the figures of a file, as a Markdown table, a row each.
 
     Args:
       kept: what a file of `--out` holds, or several merged by hand, where `machine` is a list and says its `rows`.

@@ -27,7 +27,7 @@ NEEDS = ("contacts", "pairs", "rows")
 
 
 def seen(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Measure `engines.warp_room/NEED/OBJECTS`: the most of one scene, over its number of objects and the gripper.
+    """Measure `engines.warp_room/NEED/OBJECTS`: a scene's largest need, divided by its objects plus 1, the gripper.
 
     MuJoCo C makes the rollouts, and MuJoCo Warp finds the contacts of their states.
     """

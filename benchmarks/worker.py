@@ -1,4 +1,4 @@
-"""A framework in a process of its own, so that its peak memory and its threads are its own: both ends of the pipe."""
+"""Run a framework in a process of its own, to measure its memory and threads alone: both ends of the pipe."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FLOAT32 = "float32"
 
 
 def serve(step: Step, parameters: int) -> None:
-    """Print the seconds of as many steps as each line of standard input says; at its end, parameters and memory."""
+    """For each number on standard input, print the seconds of as many steps; at its end, parameters and memory."""
     for line in sys.stdin:
         begun = time.perf_counter()
         for _ in range(int(line)):

@@ -178,7 +178,7 @@ def _remarks(about: dict[str, Any]) -> Iterator[str]:
 
 
 def _selects(counts: Counts) -> str:
-    """Return the controls to sift by."""
+    """Return the controls that filter episodes."""
     offered = {name: counts[f"episodes by {name}"] for name in ("fault", "distance", "outcome")}
     offered["shape"] = counts["objects by shape"]
     found = []

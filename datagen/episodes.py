@@ -45,7 +45,7 @@ def push_batch(
     actions: int,
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,),
 ) -> Batch:
-    """Push `actions` times on each of up to `count` settled scenes, and every push once for each of `distances`."""
+    """Push `actions` times on each of up to `count` settled scenes, each push once for each of `distances`."""
     drop, aim = jax.random.split(key)
     items, counts = clutter.settled(drop, engine, config, count)
     n = len(items.fault)
@@ -145,7 +145,7 @@ def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
 
 
 def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int) -> Batch:
-    """Settled scenes, nothing done to them."""
+    """Return settled scenes on which nothing has been done."""
     items, counts = clutter.settled(key, engine, config, count)
     return Batch(items if len(items.fault) else None, counts)
 

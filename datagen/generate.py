@@ -116,7 +116,7 @@ class _Tally:
 
 
 def _maker(job: Job, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
-    """The function that makes a batch of episodes of `job`: (key, engine, scenes, *, count)."""
+    """Return the function that makes a batch of episodes of `job`: (key, engine, scenes, *, count)."""
     guide = episodes.Guide(scorer, job.guided, job.hard) if scorer else None
     makers: dict[str, Callable[..., episodes.Batch]] = {
         "push": functools.partial(episodes.push_batch, actions=job.actions, distances=job.distances),
@@ -216,7 +216,7 @@ def generate(
 
 
 def _gather(finished: Generator[tuple[str, dict[str, Any]], None, None], tally: _Tally, made: dict[str, Any]) -> None:
-    """Take the entries of shards that are made elsewhere, as they are finished, into `made`."""
+    """Add the entry of each shard to `made` as the cluster finishes it."""
     with contextlib.closing(finished):
         for name, entry in finished:
             made[name] = entry

@@ -14,7 +14,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, manifest, owner, records, shards
 from dipn_jax.system import files, typed
 
-MOST_SAID = 400
+MAX_MESSAGE_CHARS = 400
 """Characters of what differs between two data sets that are shown at most."""
 
 
@@ -62,8 +62,8 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> None:
         if others or (config.exists() and files.read_json(config) != identity):
             raise UserError(f"--out {out}: holds another data set; give another folder")
         files.write_json(config, identity)
-        if first is not None and (first / accounting.ASKED).exists():
-            files.write_json(out / accounting.ASKED, files.read_json(first / accounting.ASKED))
+        if first is not None and (first / accounting.REQUEST_FILE).exists():
+            files.write_json(out / accounting.REQUEST_FILE, files.read_json(first / accounting.REQUEST_FILE))
         _copy(dict(zip(names, entries, strict=True)), out)
     _say(sets, out)
 
@@ -147,7 +147,7 @@ def _say(sets: dict[pathlib.Path, list[Entry]], out: pathlib.Path) -> None:
         apart = _differences(sets[first][0].meta["config"], sets[folder][0].meta["config"])
         if apart:
             said = "; ".join(f"{key} {mine} and {its}" for key, (mine, its) in apart.items())
-            console.say(f"{first} and {folder} differ: {typed.one_line(said, most=MOST_SAID)}")
+            console.say(f"{first} and {folder} differ: {typed.one_line(said, most=MAX_MESSAGE_CHARS)}")
     about = records.summary(out)
     if about["missing"]:
         console.warn(about["missing"])
@@ -184,7 +184,7 @@ def gather(folder: pathlib.Path) -> None:
         for entry in entries[1:]:
             if apart := _differences(entries[0].meta["config"], entry.meta["config"]):
                 key, (one, other) = next(iter(apart.items()))
-                said = typed.one_line(f"{key} {one} and {other}", most=MOST_SAID)
+                said = typed.one_line(f"{key} {one} and {other}", most=MAX_MESSAGE_CHARS)
                 raise UserError(
                     f"merge: {entries[0].path} and {entry.path} differ in {said}; copy only shards of one data set "
                     "together, and join others by merge A B --out C"

@@ -60,7 +60,7 @@ class Set:
         return np.array(found)
 
     def engine(self, name: EngineName | None, timestep: float | None, threads: int | None) -> Engine:
-        """Return the engine called `name`, or that which made the data set, as it was then."""
+        """Return the engine called `name`, or the engine and time step that made the data set."""
         if name is None and timestep is None:
             timestep = self.config.get("timestep")
         return make_engine(name or self.config.get("engine", "auto"), timestep=timestep, threads=threads)
@@ -68,7 +68,7 @@ class Set:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """How far an episode came out from what is stored."""
+    """How far a simulated episode is from the stored one."""
 
     apart: float  # metres: largest distance of an object from where it is stored
     turned: float  # radians: largest turn of an object from how it is stored
@@ -127,7 +127,7 @@ def replayed(episodes: Any, engine: Engine) -> Any:
 
 
 def difference(stored: Any, again: Any) -> Difference:
-    """Return how far one episode has come out from what is stored; of the objects on its table."""
+    """Return how far one simulated episode is from the stored one, over the objects on its table."""
     there = np.asarray(stored.scene.shape) >= 0
     names = ("poses", "after") if isinstance(stored, PushEpisode) else ("after",)
     old, new = (
@@ -160,7 +160,7 @@ def _flags(stored: Any, again: Any) -> list[str]:
 
 
 def report(data: Set, chosen: np.ndarray, engine: Engine, tolerance: float | None) -> int:
-    """Replay the `chosen` episodes, print how far each comes out, and a summary.
+    """Replay the `chosen` episodes, print how far each is from what is stored, and a summary.
 
     Args:
       data: where they are from.

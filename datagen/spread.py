@@ -41,7 +41,7 @@ def elsewhere(where: Launch, *, threads: int | None, network: pathlib.Path | Non
 def make_shard(
     job: Job, described: dict[str, Any], index: int, out: pathlib.Path, threads: int, network: pathlib.Path | None
 ) -> tuple[str, dict[str, Any]]:
-    """Make and write one shard, and return its name and its entry; a task, which may have been tried before.
+    """Make and write one shard, and return its name and its entry. Runs as a Ray task, so it may be retried.
 
     Args:
       job: everything that determines the data set.

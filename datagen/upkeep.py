@@ -12,7 +12,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.system import addresses
 from dipn_jax.system.addresses import Place
 
-MOST_SHOWN = 2000
+MAX_PAGE_EPISODES = 2000
 """Episodes on a page at most: about 10 MB."""
 
 
@@ -79,7 +79,7 @@ def info(
     """
     from dipn_jax.storage import accounting, mirror, records
 
-    console.require_between(1, MOST_SHOWN, sample=sample)
+    console.require_between(1, MAX_PAGE_EPISODES, sample=sample)
     console.require_seed(seed)
     if html is not None:
         option_paths.require_file(html, ".html", ".htm", option="html")

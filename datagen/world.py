@@ -36,7 +36,7 @@ Metrics = dict[str, float]
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """An engine, and settings of it that differ from its own."""
+    """An engine with settings that differ from its defaults."""
 
     engine: EngineName
     timestep: float | None = None  # seconds
@@ -64,7 +64,7 @@ class Trial:
     grasps: Grasp  # [B, A]
 
     def first(self, count: int) -> Trial:
-        """Return the first `count` of them."""
+        """Return the first `count` scenes of the trial."""
         some = slice(0, count)
         items, pushes = structs.take(self.items, some), structs.take(self.pushes, some)
         return Trial(items, pushes, structs.take(self.grasps, some))

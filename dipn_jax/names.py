@@ -12,7 +12,7 @@ EngineName = Literal["auto", "native", "mjx", "mjx_warp", "warp"]
 MethodName = Literal["dipn+gn", "dipn+gn+actions", "gn", "dqn+gn", "rea+dipn", "vpg", "physics+gn"]
 """A method that clears tables, named after the networks (or the physics engine) that it decides with."""
 Aid = Literal["mirrors", "fingers", "border", "table", "top", "still", "memory"]
-"""What helps a method to decide and no paper has:
+"""Small rules of ours that are in no paper and help a method to decide:
 
 mirrors: a grasp is chosen by the lowest of its score and the scores of its mirror images, and DIPN's prediction is the
   mean over a push and its mirror image.
@@ -24,4 +24,4 @@ still: predicted motions of less than half a pixel are not drawn.
 memory: the scores of grasps like one that missed are halved as long as the table looks the same around them.
 """
 ALL_AIDS: tuple[Aid, ...] = get_args(Aid)
-"""All aids, which a method has unless told otherwise."""
+"""All aids; the default of every method."""

@@ -42,7 +42,7 @@ class Fault(enum.IntFlag):
     OUTSIDE = 8  # an object's centre is outside the workspace
     SPEED = 16  # an object moved faster than anything dropped or pushed should
     PENETRATION = 32  # an object is in the table, or in another, or was deep in one on the way
-    SHORT = 64  # the gripper did not reach its commanded pose, or left its path on the way
+    GRIPPER_SHORT = 64  # the gripper did not reach its commanded pose, or left its path on the way
     TIPPED = 128  # a push tipped an object over
 
     UNUSABLE = NON_FINITE | CAPACITY | SPEED | PENETRATION

@@ -11,8 +11,8 @@ import numpy as np
 class Workspace:
     """The square that the camera sees. Source: DIPN's released code (0.448 m, 2 mm a pixel)."""
 
-    side: float = 0.448
-    pixels: int = 224
+    side: float = 0.448  # metres
+    pixels: int = 224  # along a side
 
     @property
     def half(self) -> float:
@@ -32,19 +32,19 @@ class Gripper:
     The closing axis is the gripper's own x; its pads are `pad_width` wide along its own y.
     """
 
-    stroke: float = 0.074  # inner gap, open
-    thickness: float = 0.020  # of a finger along the closing axis: outer gap 0.114 open
-    pad_depth: float = 0.006  # the part of the thickness that is sticky
-    pad_width: float = 0.020
-    finger_length: float = 0.14
-    push_gap: float = 0.006  # inner gap while pushing: outer width 0.046
+    stroke: float = 0.074  # metres, inner gap when open
+    thickness: float = 0.020  # metres, of a finger along the closing axis: outer gap 0.114 when open
+    pad_depth: float = 0.006  # metres, the part of the thickness that is sticky
+    pad_width: float = 0.020  # metres
+    finger_length: float = 0.14  # metres
+    push_gap: float = 0.006  # metres, inner gap while pushing: outer width 0.046
     mass: float = 1.0  # kg, hand
     finger_mass: float = 0.1  # kg, each
     bandwidth: float = 100.0  # rad/s of the critically damped position loop
     grip_force: float = 15.0  # N, most that a finger closes with
     hand_force: float = 60.0  # N, most that the hand presses down with
-    push_tip: float = 0.02  # height of the tip while pushing
-    lift: float = 0.15  # metres a grasped object is lifted
+    push_tip: float = 0.02  # metres, height of the tip while pushing
+    lift: float = 0.15  # metres, by which a grasped object is lifted
 
     @property
     def lag(self) -> float:

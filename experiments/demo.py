@@ -69,12 +69,12 @@ TABLES = {"hard": "the ten hard instances, once each", "random-10": "random, 10 
 
 
 def _share(values: dict[str, Any], key: str) -> str:
-    """A share with its interval, in per cent."""
+    """Return a share with its interval, in per cent."""
     return f"{100 * values[key]:.1f} [{100 * values[f'{key}_low']:.0f}, {100 * values[f'{key}_high']:.0f}]"
 
 
 def tables(values: dict[str, Any]) -> list[str]:
-    """All tables of the page, from the numbers of the report."""
+    """Return all tables of the page, from the numbers of the report."""
     columns = ("5cm/all", "5cm/moved", "10cm/all", "10cm/moved")
     errors = [
         [title, *(f"{values[f'push_error/{name}/{column}']:.3f}" for column in columns)]

@@ -166,7 +166,7 @@ def _write_page(out: pathlib.Path, code: str) -> None:
 
 
 def nearer(point: Point, taken: Collection[Point]) -> list[Point]:
-    """Return the faults to try instead, one after another, if `point` is not reached; none of them is in `taken`."""
+    """Return earlier faults to try in turn if `point` is not reached; none of them is in `taken`."""
     found: list[Point] = []
     for part in NEARER:
         calls = range(math.ceil(part * point.when), 0, -1)

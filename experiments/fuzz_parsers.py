@@ -205,7 +205,7 @@ def _parsers() -> list[Parser]:
         Parser("settings", "settings.json", _save_cleared, _report, tree),
         Parser("metrics", "metrics.json", _save_cleared, _report, tree),
         Parser("log", "metrics.jsonl", _log, lambda at: curves.load_grasp_runs([at]), lines),
-        Parser("training", "config.json", _begin_training, _go_on_training, tree),
+        Parser("training", "config.json", _begin_training, _continue_training, tree),
         Parser("examples", "state.json", _keep_examples, _keep_examples, tree),
         Parser("stamp", runs.STAMP, _stamp, lambda at: runs.is_complete(_run(at), "key"), tree),
     ]
@@ -218,7 +218,7 @@ def _copy_cases(folder: pathlib.Path) -> None:
 
 
 def _configuration(folder: pathlib.Path) -> None:
-    """Read a configuration as accounting does, and as a command does that goes on with its data set."""
+    """Read a configuration as `accounting` reads it, and as a command that continues the data set does."""
     records.missing(folder)
     begun = files.read_json(folder / "config.json")
     files.claim(folder, {**CONFIG, "episodes": begun["episodes"]}, free=("episodes",))
@@ -243,8 +243,8 @@ def _begin_training(folder: pathlib.Path) -> None:
     loop._claim(folder, dataclasses.asdict(TRAINING), TRAINING)
 
 
-def _go_on_training(folder: pathlib.Path) -> None:
-    """Read the configuration as the command does that goes on with the training."""
+def _continue_training(folder: pathlib.Path) -> None:
+    """Read the configuration as the command that continues the training does."""
     loop._claim(folder, dataclasses.asdict(TRAINING), TRAINING, write=False)
 
 

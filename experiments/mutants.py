@@ -59,7 +59,7 @@ PAGE = "testing"
 
 
 def section(values: dict[str, Any]) -> str:
-    """Return what all modules come to, the table of those measured, and a sentence that names the others, as Markdown.
+    """Return as Markdown the totals, the table of the measured modules, and a sentence that names the others.
 
     Args:
       values: module -> its `mutants_session.result`; a module that is missing was not measured.

@@ -136,7 +136,7 @@ def _python(copy: pathlib.Path, module: str, *arguments: str) -> None:
 def _prepare(
     copy: pathlib.Path, config: pathlib.Path, session: pathlib.Path, module: str, tests: Sequence[str]
 ) -> None:
-    """Begin a session, or take up a begun one: all again if the module has changed, survivors if its tests have."""
+    """Begin a session or continue one: all mutants again if the module has changed, survivors if its tests have."""
     from cosmic_ray.work_db import use_db
 
     stamp = session.with_suffix(".json")

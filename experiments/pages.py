@@ -81,7 +81,7 @@ def _seeds(facts: dict[str, Any]) -> str:
 
 
 def _grouped(by_run: dict[str, str]) -> str:
-    """Each value once, with the runs that have it; the one that most have goes last, without their names if several."""
+    """Return each value once, with the runs that have it; the commonest goes last, without their names if several."""
     if not by_run:
         return NOT_RECORDED
     groups: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""What runs promise: each with the tests that fail where it is broken, and what was counted of it."""
+"""The promises of commands, each with the tests that fail where it is broken, and with the counts for it."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ PROMISES = (
         "SIGINT, SIGTERM, SIGHUP and SIGUSR1 save and end work alike, also where one arrives in a callback of JAX.",
         (
             "tests/dipn_jax/system/test_interruption.py::"
-            "test_a_signal_lets_the_step_at_hand_end_and_a_command_ends_as_interrupted",
+            "test_a_signal_lets_the_current_step_end_and_interrupts_the_command",
             "tests/dipn_jax/system/test_interruption.py::test_a_signal_within_a_callback_is_not_lost",
         ),
     ),

@@ -54,7 +54,7 @@ PUSHED = PolicyConfig(gamma=50.0, grasp_above=9.0)
 
 @dataclasses.dataclass
 class PushFirst:
-    """A policy that pushes once, on its first call, and then goes on with another."""
+    """A policy that pushes once, on its first call, and then decides as another policy."""
 
     push: TablePolicy
     then: TablePolicy
@@ -96,7 +96,7 @@ def _at(table: Instance, step: int) -> Instance:
 
 
 def _shortfalls(states: Sequence[tuple[Instance, int]]) -> list[float]:
-    """Return the sum over objects of what their best grasps lack, in each state."""
+    """Return for each state how far the best grasps of all objects are from sure, summed over objects."""
     estimate = jax.jit(outlook.misses_to_come(scorers.load_scorer(BUILTIN)))
     found = []
     for table, step in states:

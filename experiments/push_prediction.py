@@ -102,7 +102,7 @@ SHIFTS = {
 COLUMNS = [(f"{c}cm", which) for c in curves.DISTANCES for which in ("all", "moved")]
 """Distance and objects of each column of errors."""
 TITLES = [f"{at.replace('cm', ' cm')}, {which}" for at, which in COLUMNS]
-"""Titles of these columns."""
+"""Titles of the columns of errors."""
 
 
 def shift_table(values: dict[str, Any]) -> str:

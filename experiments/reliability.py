@@ -92,7 +92,7 @@ WAYS: dict[str, Callable[[pathlib.Path], None]] = {
 
 
 def damage(run: pathlib.Path, ways: Sequence[str] = tuple(WAYS)) -> dict[str, int]:
-    """Damage every file of a run's newest step in every way, one at a time, and count after how many the run goes on.
+    """Damage every file of a run's newest step in every way, one at a time, and count after how many the run continues.
 
     Args:
       run: a run of GN with two steps; it is changed and mended again.
@@ -100,7 +100,7 @@ def damage(run: pathlib.Path, ways: Sequence[str] = tuple(WAYS)) -> dict[str, in
 
     Returns:
       `damaged`, how often that was done, and `recovered`, how often the step before was loaded instead, by an
-      evaluation and by a training that goes on.
+      evaluation and by a training that continues.
     """
     from dipn_jax.storage import checkpoint
 

@@ -188,6 +188,18 @@ def test_help_shows_examples(stage: str, capfd: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.mark.parametrize("stage", COMMANDS)
+def test_help_breaks_no_line_where_the_source_does(
+    stage: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "5000")  # so that help itself breaks no line
+    for name in COMMANDS[stage]:
+        boxed = [line.strip("│ ") for line in _help(stage, name, capfd=capfd).splitlines() if line.startswith("│")]
+        assert len(boxed) > 1
+        for line in boxed:
+            assert line.startswith(("-", "─")) or line.endswith((".", ")")), f"{name}: {line} ends in mid-sentence"
+
+
+@pytest.mark.parametrize("stage", COMMANDS)
 def test_the_list_of_commands_has_a_sentence_for_each(stage: str, capfd: pytest.CaptureFixture[str]) -> None:
     text = " ".join(_help(stage, capfd=capfd).replace("│", " ").split())
     for command in COMMANDS[stage].values():

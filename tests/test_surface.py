@@ -109,9 +109,9 @@ def test_structs_are_indexed_by_row(settled: Any) -> None:
 def test_policies_of_the_shipped_networks_share_what_is_compiled_unless_their_aids_differ() -> None:
     one = methods.load_policy("dipn+gn")
     other = methods.load_policy("dipn+gn", config=PolicyConfig(gamma=0.5, candidates=4))
-    assert other.act is one.act and other.rule.gamma == 0.5 and len(other.distances) == 4
+    assert other.decide_function is one.decide_function and other.rule.gamma == 0.5 and len(other.distances) == 4
     bare = methods.load_policy("dipn+gn", config=PolicyConfig(aids=()))
-    assert bare.act is not one.act and bare.rule.draw_all
+    assert bare.decide_function is not one.decide_function and bare.rule.draw_all
 
 
 @pytest.mark.slow

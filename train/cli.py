@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from .split import Folders
 
 PUSH = TrainConfig(steps=1500, learning_rate=3e-3, eval_every=250, save_every=250)
-"""How `push` trains unless told otherwise."""
+"""Defaults of `dipn-train push`."""
 GRASP_PRETRAIN = TrainConfig(steps=400, batch=8, learning_rate=2e-3, eval_every=100, save_every=100)
-"""How `grasp-pretrain` trains unless told otherwise."""
+"""Defaults of `dipn-train grasp-pretrain`."""
 GRASP = TrainConfig(steps=800, eval_every=250, save_every=250)
-"""How `grasp` trains unless told otherwise."""
+"""Defaults of `dipn-train grasp`."""
 
 
 def _fit(

@@ -28,28 +28,31 @@ _ADDRESS = re.compile(r"(?:\[[0-9A-Fa-f:.%]+\]|[\w.-]+):(?P<port>[0-9]{1,5})", r
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """How a network learns from a data set."""
+    """How a network learns from a data set.
+
+    Attributes:
+      steps: Optimizer steps.
+      batch: Examples in a step.
+      learning_rate: The highest learning rate of the run.
+      weight_decay: Weight decay.
+      optimizer: adamw with cosine decay; sgd with momentum 0.9 and a constant rate; or published, as DIPN was: sgd
+        whose rate rises in the first epoch and falls to a tenth after each third of the steps.
+      seed: Seed of weights, order and augmentation.
+      mix: For each folder of --data, how much of every batch is taken from it (3 1: three quarters from the first); an
+        epoch then ends for each by itself. Without it, every example is seen once an epoch.
+      eval_every: Steps between points of the learning curve.
+      save_every: Steps between checkpoints.
+    """
 
     steps: int = 2000
-    """Optimizer steps."""
     batch: int = 32
-    """Examples in a step."""
     learning_rate: float = 1e-3
-    """The highest learning rate of the run."""
     weight_decay: float = 1e-4
-    """Weight decay."""
     optimizer: Literal["adamw", "sgd", "published"] = "adamw"
-    """adamw with cosine decay; sgd with momentum 0.9 and a constant rate; or published, as DIPN was: sgd whose rate
-    rises in the first epoch and falls to a tenth after each third of the steps."""
     seed: int = 0
-    """Seed of weights, order and augmentation."""
     mix: tuple[float, ...] = ()
-    """For each folder of --data, how much of every batch is taken from it (3 1: three quarters from the first); an
-    epoch then ends for each by itself. Without it, every example is seen once an epoch."""
     eval_every: int = 200
-    """Steps between points of the learning curve."""
     save_every: int = 200
-    """Steps between checkpoints."""
 
     def __post_init__(self) -> None:
         console.require_positive(
@@ -67,32 +70,35 @@ class TrainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Compute:
-    """How steps are computed."""
+    """How steps are computed.
+
+    Attributes:
+      data_parallel: Share each batch among all devices: of this machine, or of all processes of the job. What is learnt
+        is the same but for rounding, and a run may continue with another number of devices.
+      accumulate: Parts that each batch is computed in, one after another, for less memory. The gradient is the mean of
+        theirs, and each has its own statistics and random numbers.
+      precision: Precision of what the network's layers compute; weights, statistics and losses stay float32.
+      memory: GB of episodes, and of examples of push and grasp with compact networks, kept in memory. If episodes need
+        more, they are kept in files that are gone when the command ends; if examples do, each is made when it is first
+        used and kept in files under OUT/examples, which may be deleted afterwards.
+      compile_only: Compile a step, say what memory it needs, and write nothing but the compiled program that JAX keeps.
+      check_only: Check options, data and OUT, and write nothing.
+      profile: Folder for a profile of ten steps, for TensorBoard or Perfetto.
+      coordinator: HOST:PORT of process 0 of a job of several; SLURM, Open MPI and Kubernetes tell it themselves.
+      processes: Number of processes of the job, with --coordinator.
+      process: Which of them this one is, counted from 0, with --coordinator.
+    """
 
     data_parallel: bool = False
-    """Share each batch among all devices: of this machine, or of all processes of the job. What is learnt is the same
-    but for rounding, and a run may go on with another number of devices."""
     accumulate: int = 1
-    """Parts that each batch is computed in, one after another, for less memory. The gradient is the mean of theirs, and
-    each has its own statistics and random numbers."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision of what the network's layers compute; weights, statistics and losses stay float32."""
     memory: float = 8.0
-    """GB of episodes, and of examples of push and grasp with compact networks, kept in memory. If episodes need more,
-    they are kept in files that are gone when the command ends; if examples do, each is made when it is first used and
-    kept in files under OUT/examples, which may be deleted afterwards."""
     compile_only: bool = False
-    """Compile a step, say what memory it needs, and write nothing but the compiled program that JAX keeps."""
     check_only: bool = False
-    """Check options, data and OUT, and write nothing."""
     profile: pathlib.Path | None = None
-    """Folder for a profile of ten steps, for TensorBoard or Perfetto."""
     coordinator: str = ""
-    """HOST:PORT of process 0 of a job of several; SLURM, Open MPI and Kubernetes tell it themselves."""
     processes: int = 1
-    """Number of processes of the job, with --coordinator."""
     process: int = 0
-    """Which of them this one is, counted from 0, with --coordinator."""
 
     def __post_init__(self) -> None:
         console.require_positive(accumulate=self.accumulate)

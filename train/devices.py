@@ -22,16 +22,16 @@ from .configs import Compute
 
 SYNC_EVERY = 10
 """Steps after which the processes of a job ask one another whether one of them has been interrupted."""
-PATIENCE = 300
+WAIT_LIMIT_SECONDS = 300
 """Seconds that a process waits for the others of its job."""
-SILENCE = 10
+WAIT_NOTICE_SECONDS = 10
 """Seconds after which it says that it does."""
 OWN_GPUS = ("SLURM_GPUS_PER_TASK", "SLURM_TRES_PER_TASK")
 """Variables of SLURM that say that each process has GPUs of its own."""
 
 
 class OneDevice:
-    """Steps on the device that JAX takes unless told otherwise."""
+    """Steps on JAX's default device."""
 
     leads = True
     """Whether this process writes the run's folder, and says how far it is."""
@@ -53,7 +53,7 @@ class OneDevice:
         return tree
 
     def any_says(self, said: bool, step: int) -> bool:
-        """Return whether a process says so; asked after every step, by all processes, answered after some."""
+        """Return whether any process wants to stop; all call it after each step and agree every SYNC_EVERY steps."""
         return said
 
     def wait(self, name: str) -> None:
@@ -138,11 +138,11 @@ def join(compute: Compute) -> None:
         if compute.process == 0:
             _require_port(compute.coordinator)
         who = compute.coordinator, compute.processes, compute.process
-        _in_time(lambda: jax.distributed.initialize(*who, initialization_timeout=2 * PATIENCE), given)
+        _in_time(lambda: jax.distributed.initialize(*who, initialization_timeout=2 * WAIT_LIMIT_SECONDS), given)
     elif _started_as_several():
         own = local_devices(os.environ)
         _in_time(
-            lambda: jax.distributed.initialize(local_device_ids=own, initialization_timeout=2 * PATIENCE),
+            lambda: jax.distributed.initialize(local_device_ids=own, initialization_timeout=2 * WAIT_LIMIT_SECONDS),
             "the job manager's processes",
         )
 
@@ -228,13 +228,13 @@ def _in_time(meet: Callable[[], None], given: str) -> None:
             met.set_result(None)
 
     threading.Thread(target=call, daemon=True).start()
-    if not concurrent.futures.wait([met], timeout=SILENCE).done:
-        console.note(f"{given}: waiting for the other processes, {PATIENCE:.0f} s at most")
-        concurrent.futures.wait([met], timeout=PATIENCE - SILENCE)
+    if not concurrent.futures.wait([met], timeout=WAIT_NOTICE_SECONDS).done:
+        console.note(f"{given}: waiting for the other processes, {WAIT_LIMIT_SECONDS:.0f} s at most")
+        concurrent.futures.wait([met], timeout=WAIT_LIMIT_SECONDS - WAIT_NOTICE_SECONDS)
     if not met.done():
         raise UserError(
-            f"{given}: not all processes came within {PATIENCE:.0f} s; look whether each of them was started, and can "
-            "reach process 0 there"
+            f"{given}: not all processes came within {WAIT_LIMIT_SECONDS:.0f} s; look whether each of them was "
+            "started, and can reach process 0 there"
         )
     if error := met.exception():
         said = typed.one_line(str(error) or type(error).__name__, most=200)

@@ -112,7 +112,7 @@ class ExampleStore:
         return jax.tree.unflatten(self._structure, [np.asarray(array[index]) for array in leaves])
 
     def _open(self, some: Any) -> None:
-        """Map the files, which are made if those of another process cannot be taken up; `some` examples show shapes."""
+        """Map the example files, creating them unless an earlier process's can be reused; `some` shows shapes."""
         leaves, self._structure = jax.tree.flatten(some)
         shapes = [((self._count, *np.shape(leaf)[1:]), np.asarray(leaf).dtype) for leaf in leaves]
         shapes.append(((self._count,), np.dtype(bool)))

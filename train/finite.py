@@ -38,7 +38,7 @@ class Watch:
         Args:
           rate: learning rate, for the message.
           examples: returns the examples of a step's batch.
-          kept: says what can be gone on with, for the message.
+          kept: says from what the run can continue, for the message.
         """
         self.rate, self.examples, self.kept = rate, examples, kept
         self._first = jnp.array(-1)

@@ -41,7 +41,7 @@ class Log:
     """
 
     def __init__(self, out: pathlib.Path, begin: int, *, batch: int, writes: bool = True) -> None:
-        """Open the files of a run that goes on after step `begin`, if this process `writes` them."""
+        """Open the files of a run that continues after step `begin`, if this process `writes` them."""
         self.path, self._batch = out / "metrics.jsonl", batch
         self._since: tuple[int, float] | None = None  # step and time since which steps are timed; None: a pause
         self._timed = (0, 0.0)  # steps, and their seconds, since the point before

@@ -27,19 +27,19 @@ from .ahead import Ahead
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check
 from .optimizers import make_optimizer
 
-JUDGE = "held_out_loss"
+BEST_MEASURE = "held_out_loss"
 """Measure that is lowest at the best step of a run."""
 
 
-class Taught(Protocol):
-    """The part of a task that an optimizer step needs."""
+class LossTask(Protocol):
+    """Something with a loss; all that `make_step` needs of a task."""
 
     def loss(self, model: nnx.Module, batch: Any, key: jax.Array) -> jax.Array:
         """Return the loss of a batch of examples, inside jit."""
         ...
 
 
-class Task(Taught, Protocol):
+class Task(LossTask, Protocol):
     """Something to learn: data, a loss and a measure."""
 
     network: str  # key of checkpoint.NETWORKS
@@ -54,7 +54,7 @@ class Task(Taught, Protocol):
         ...
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
-        """Return measures on examples that are held out, JUDGE among them."""
+        """Return measures on examples that are held out, BEST_MEASURE among them."""
         ...
 
 
@@ -65,7 +65,7 @@ def _split(model: nnx.Module) -> tuple[Any, Any, Any]:
 
 
 def make_step(
-    task: Taught, graph: Any, optimizer: optax.GradientTransformation, *, compute: Compute = DEFAULT_COMPUTE
+    task: LossTask, graph: Any, optimizer: optax.GradientTransformation, *, compute: Compute = DEFAULT_COMPUTE
 ) -> Callable[..., Any]:
     """Return the jitted step `(params, rest, moments, batch, key) -> (params, rest, moments, loss)`.
 
@@ -208,8 +208,8 @@ def _fit(
                 latest = {"loss": float(where.here(loss)), **task.evaluate(model)}
                 watch.check(step, where.here(params), **latest)
                 speed = curve.write(step, latest)
-                if not best or latest[JUDGE] < best["best"]["value"]:
-                    best, due = {"best": {"step": step, "measure": JUDGE, "value": latest[JUDGE]}}, True
+                if not best or latest[BEST_MEASURE] < best["best"]["value"]:
+                    best, due = {"best": {"step": step, "measure": BEST_MEASURE, "value": latest[BEST_MEASURE]}}, True
             if due:
                 save(step)
             if stopping:
@@ -284,6 +284,6 @@ def _claim(out: pathlib.Path, identity: dict[str, Any], config: TrainConfig, *, 
     files.claim(out, identity | {"steps": begun}, write=write)
     if begun != config.steps:
         raise UserError(
-            f"{out}: its learning rate is planned for --steps {begun}, so that it cannot go on to {config.steps}; give "
-            f"--init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
+            f"{out}: its learning rate is planned for --steps {begun}, so that it cannot continue to {config.steps}; "
+            f"give --init {out} and another --out to train on, or --optimizer sgd (a constant rate) from the start"
         )

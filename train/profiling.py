@@ -8,14 +8,14 @@ from typing import Self
 
 import jax
 
-FIRST = 5
-"""Step of this process at which a profile begins; before it, programs are compiled."""
-LAST = 15
+FIRST_STEP = 5
+"""Step of this process at which a profile begins; earlier steps compile programs."""
+LAST_STEP = 15
 """Step of this process at which the profile ends."""
 
 
 class Profiler:
-    """A context in which steps FIRST to LAST are traced by JAX's profiler, if a folder is given."""
+    """A context in which steps FIRST_STEP to LAST_STEP are traced by JAX's profiler, if a folder is given."""
 
     def __init__(self, folder: pathlib.Path | None, begin: int) -> None:
         """Prepare to profile a run that begins with step `begin`, into `folder`."""
@@ -25,10 +25,10 @@ class Profiler:
         """Begin or end the profile, where this step is the first or the last of it."""
         if self._folder is None:
             return
-        if step == self._begin + FIRST:
+        if step == self._begin + FIRST_STEP:
             jax.profiler.start_trace(self._folder)
             self._going = True
-        elif step == self._begin + LAST:
+        elif step == self._begin + LAST_STEP:
             self._stop()
 
     def _stop(self) -> None:

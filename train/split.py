@@ -21,7 +21,7 @@ Folders = pathlib.Path | tuple[pathlib.Path, ...]
 """One data set, or several."""
 Choose = Callable[[Any, pathlib.Path], np.ndarray | None]
 """Function of the episodes of a data set and its folder: the numbers of those that are used, or None for all."""
-_SOME = 10_000
+_COPIED_AT_A_TIME = 10_000
 """Episodes that are copied at a time."""
 
 
@@ -77,8 +77,8 @@ def _gathered(parts: list[tuple[Any, np.ndarray]], space: Space) -> Any:
     slots = max(episodes.scene.shape.shape[1] for episodes, _ in parts)
     made, at = Filled(sum(len(rows) for _, rows in parts), space, what="episodes"), 0
     for episodes, rows in parts:
-        for begin in range(0, len(rows), _SOME):
-            some = structs.take(episodes, rows[begin : begin + _SOME])
+        for begin in range(0, len(rows), _COPIED_AT_A_TIME):
+            some = structs.take(episodes, rows[begin : begin + _COPIED_AT_A_TIME])
             made.put(at, widened(some, slots))
             at += len(some.fault)
     return made.whole

@@ -29,7 +29,7 @@ _TRAINING = {
     "values": typed.Maybe({str: float}),
 }
 _FORM = {"command": [str], "trainings": {str: _TRAINING}}
-_FREE = ("out", "seed", "limit", "threads", "memory", "data_parallel", "profile")
+_UNCOMPARED_OPTIONS = ("out", "seed", "limit", "threads", "memory", "data_parallel", "profile")
 """Options that differ between trainings, or on which no result depends."""
 
 
@@ -128,7 +128,7 @@ def plan(
 
 
 def _check_steps(command: Sequence[str], *, limits: Sequence[int], steps: Sequence[int]) -> None:
-    """Return if there are steps for every limit, or none at all.
+    """Raise an error unless there are steps for every limit, or none at all.
 
     Raises:
       UserError: there are not, one is below 1, or the command says how many, too.
@@ -161,7 +161,7 @@ def _parsed(command: Sequence[str], out: pathlib.Path) -> tuple[str, dict[str, A
 
 
 def _record(out: pathlib.Path, trainings: Sequence[Training], *, own_steps: bool) -> dict[str, Any]:
-    """Return the content of `sweep.json` with all trainings in it, those that are there with what they measured.
+    """Return the content of `sweep.json`: all trainings, those in the present file with what they measured.
 
     Where each limit has its own steps (`own_steps`), one that made another number of them has measured nothing yet.
 
@@ -172,7 +172,7 @@ def _record(out: pathlib.Path, trainings: Sequence[Training], *, own_steps: bool
 
     first = trainings[0]
     commands: dict[str, Any] = cli.COMMANDS
-    free = (*_FREE, "steps") if own_steps else _FREE
+    free = (*_UNCOMPARED_OPTIONS, "steps") if own_steps else _UNCOMPARED_OPTIONS
     command = [first.kind, *command_line.words(commands[first.kind], first.given, without=free)]
     path = out / RECORD
     record: dict[str, Any] = {"command": command, "trainings": {}}

@@ -42,7 +42,7 @@ class Training:
 
 
 def check(trainings: Iterable[Training]) -> None:
-    """Return if the trainings can begin; those that learn while they act have no data that could be wrong.
+    """Raise an error unless the trainings can begin; those that learn while they act have no data to check.
 
     Raises:
       UserError: an option, the data or a folder is wrong.
@@ -63,7 +63,12 @@ def last(run: pathlib.Path) -> Values:
 
 
 def train(kind: str, given: dict[str, Any]) -> Values:
-    """Train, or go on, and return what was measured last; a task, which may have been tried before."""
+    """Train, or continue a training, and return its last measurements. Runs as a Ray task, so it may be retried.
+
+    Args:
+      kind: command of dipn-train.
+      given: its options by name, as its function takes them; a dictionary, because each command has its own options.
+    """
     from . import cli
 
     commands: dict[str, Any] = cli.COMMANDS
@@ -83,7 +88,7 @@ def on_cluster(todo: Sequence[Training], *, where: Launch) -> Generator[tuple[in
 def here(todo: Sequence[Training], *, at_once: int) -> Generator[tuple[int, Values], None, None]:
     """Train in processes of this machine; yield number and values of each training as it ends.
 
-    Where it is closed, or one cannot go on, the others save their state and stop first.
+    Where it is closed, or one cannot continue, the others save their state and stop first.
 
     Args:
       todo: the trainings.
@@ -104,7 +109,7 @@ def here(todo: Sequence[Training], *, at_once: int) -> Generator[tuple[int, Valu
 
 
 def _train_alone(training: Training, children: _Children) -> Values:
-    """Train in a process; one that is killed is started again, up to RETRIES times, and goes on from its last step."""
+    """Train in a process; if killed it is started again, up to RETRIES times, and continues from its last step."""
     for _ in range(RETRIES + 1):
         code, error = _call([training.words()], training.name, children)
         if children.stopped:
@@ -113,12 +118,12 @@ def _train_alone(training: Training, children: _Children) -> Values:
             return last(training.given["out"])
         if code > 0 and code != _INTERRUPTED:
             raise UserError(error or f"{training.name}: ended with exit code {code}, for the reason above")
-        console.note(f"{training.name}: its process was killed ({code}); goes on from its last checkpoint")
+        console.note(f"{training.name}: its process was killed ({code}); continues from its last checkpoint")
     raise UserError(f"{training.name}: its process was killed {RETRIES + 1} times, often for memory; see --at-once")
 
 
 class _Children:
-    """Processes that go on until they end, or are asked to stop."""
+    """The processes of trainings, which run until they end or are asked to stop."""
 
     def __init__(self) -> None:
         self.stopped = False
@@ -152,7 +157,7 @@ class _Children:
             self._going.discard(process)
 
     def stop(self) -> None:
-        """Ask all processes to stop, which `alone` takes from the end of its input."""
+        """Ask all processes to stop by closing their input, which `alone` watches."""
         with self._lock:
             self.stopped = True
             for process in self._going:

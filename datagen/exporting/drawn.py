@@ -12,13 +12,13 @@ from dipn_jax.structs import Array
 
 from .columns import FRAMES, MOMENTS, Values
 
-AT_ONCE = 64
+VIEWS_IN_MEMORY = 64
 """Views that are in memory at a time, about 0.4 MB each."""
 
 
 def block(images: str) -> int:
     """Return how many episodes are rendered at a time."""
-    return max(1, AT_ONCE // (FRAMES if images == "all" else 1))
+    return max(1, VIEWS_IN_MEMORY // (FRAMES if images == "all" else 1))
 
 
 def draw(episodes: Any, images: str) -> Values:

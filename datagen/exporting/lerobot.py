@@ -20,7 +20,7 @@ from .source import SPLITS, Part
 
 TASK = "push"
 """The task of every episode, in words."""
-CHUNK = 1000
+FILES_PER_FOLDER = 1000
 """Number of files in a folder."""
 STATISTICS = ("min", "max", "mean", "std", "count")
 """Statistics that are written of every feature, for each episode and for the data set."""
@@ -52,10 +52,11 @@ class LeRobot:
         return found | {name: _feature(kinds.get(name, "int64"), None) for name in _INDEX}
 
     def _path(self, what: str, place: int) -> pathlib.Path:
-        return self.out / what / f"chunk-{place // CHUNK:03d}" / f"file-{place % CHUNK:03d}.parquet"
+        folder, file = divmod(place, FILES_PER_FOLDER)
+        return self.out / what / f"chunk-{folder:03d}" / f"file-{file:03d}.parquet"
 
     def done(self, part: Part) -> bool:
-        """Return whether a part has been written; its episodes are, after its frames."""
+        """Return whether a part has been written: its file of episodes is written after that of frames."""
         return self._path("meta/episodes", part.place).exists()
 
     def write(self, part: Part, blocks: Iterator[Values]) -> None:
@@ -127,8 +128,9 @@ class LeRobot:
         count = len(frames["index"])
         found: dict[str, Any] = {"episode_index": number, "tasks": [TASK], "length": count}
         found |= {"dataset_from_index": number * count, "dataset_to_index": (number + 1) * count}
+        folder, file = divmod(part.place, FILES_PER_FOLDER)
         for what in ("data", "meta/episodes"):
-            found |= {f"{what}/chunk_index": part.place // CHUNK, f"{what}/file_index": part.place % CHUNK}
+            found |= {f"{what}/chunk_index": folder, f"{what}/file_index": file}
         for name, value in frames.items():
             its = moments.of_pictures(value) if name in self.pictures else moments.of(value)
             found |= {f"stats/{name}/{statistic}": numbers.tolist() for statistic, numbers in its.items()}
@@ -173,7 +175,7 @@ class LeRobot:
             "total_episodes": total,
             "total_frames": total * steps.length("push"),
             "total_tasks": 1,
-            "chunks_size": CHUNK,
+            "chunks_size": FILES_PER_FOLDER,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
             "fps": steps.FPS,

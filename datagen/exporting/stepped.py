@@ -133,7 +133,7 @@ class Zarr:
         return zarr.open_group(self.out / f"{split}.zarr", mode="a", zarr_format=2)
 
     def _append(self, root: Any, name: str, column: Column, values: np.ndarray, begin: int) -> None:
-        """Write rows of an array from row `begin` on, which makes it so long."""
+        """Write rows of an array from row `begin` on, and make the array end with them."""
         import numcodecs
 
         if name not in root:

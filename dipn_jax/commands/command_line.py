@@ -35,7 +35,7 @@ def _words(option: str, value: Any) -> list[str]:
 
 
 def _changed(name: str, value: Any, default: Any) -> Iterator[tuple[str, Any]]:
-    """Return the options of an argument that are not at their default: itself, or fields of the struct that it is."""
+    """Return the options of an argument that differ from their defaults: the argument, or fields of its struct."""
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             yield from _changed(field.name, getattr(value, field.name), getattr(default, field.name))

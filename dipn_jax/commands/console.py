@@ -9,6 +9,7 @@ import inspect
 import itertools
 import os
 import pathlib
+import re
 import signal
 import sys
 import threading
@@ -16,7 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_type_hints
 
 import tyro
 
@@ -28,9 +29,10 @@ from dipn_jax.system.interruption import Stopping
 if TYPE_CHECKING:
     import rich.progress
 
-MOST = 2**31 - 1
+MAX_COUNT = 2**31 - 1
 """Largest value of an option that counts something."""
 INTERRUPTED = "interrupted: run the same command again to continue from here"
+"""What a command that was interrupted prints at its end."""
 LOG_PERIOD = 10.0
 """Seconds between progress lines where there is no terminal."""
 
@@ -58,9 +60,9 @@ def enable_compilation_cache() -> None:
 
 
 def prepare() -> None:
-    """Make streams, environment and cache what commands need; one line says which settings of JAX are ignored."""
+    """Prepare streams, environment and compilation cache for a command; warn of ignored JAX settings in one line."""
     surroundings.open_streams()
-    if ignored := surroundings.settle():
+    if ignored := surroundings.set_environment():
         warn(ignored)
     enable_compilation_cache()
 
@@ -145,12 +147,12 @@ def warn(text: str) -> None:
 
 
 def require_positive(**values: float) -> None:
-    """Raise a UserError for the first value that is no finite number above zero, or counts more than work that ends."""
+    """Raise a UserError for the first value that is no finite number above zero, or is a count over MAX_COUNT."""
     for name, value in values.items():
         if not 0 < value < float("inf"):
             raise UserError(f"{_option(name)} {value}: want a number above 0")
-        if isinstance(value, int) and value > MOST:
-            raise UserError(f"{_option(name)} {value:.3g}: want a number above 0 and at most {MOST:,}")
+        if isinstance(value, int) and value > MAX_COUNT:
+            raise UserError(f"{_option(name)} {value:.3g}: want a number above 0 and at most {MAX_COUNT:,}")
 
 
 def require_between(low: float, high: float, **values: float) -> None:
@@ -192,6 +194,17 @@ def _described(command: Callable[..., Any], *, whole: bool) -> str:
             lines = list(group)
             result += "\n" + "\n".join(lines) if is_example else "\n\n" + " ".join(lines)
     return result
+
+
+def _joined(command: Callable[..., Any]) -> Any:
+    """Return `command` with each option's text on one line of its docstring: tyro would keep the line ends in it."""
+    called: Any = option_paths.absolute(command)
+    text, head, options = inspect.cleandoc(command.__doc__ or "").partition("\nArgs:\n")
+    called.__doc__ = text + head + re.sub(r"\n {4,}", " ", options)
+    called.__signature__ = inspect.signature(command)
+    called.__annotations__ = get_type_hints(inspect.unwrap(command), include_extras=True)
+    del called.__wrapped__  # there tyro would read the docstring that is not joined
+    return called
 
 
 def run(description: str, commands: dict[str, Any], arguments: Sequence[str] | None = None) -> int:
@@ -264,7 +277,7 @@ def _parse_and_call(description: str, commands: dict[str, Any], arguments: Seque
             Any,
             tyro.conf.subcommand(
                 name,
-                constructor=option_paths.absolute(command),
+                constructor=_joined(command),
                 description=_described(command, whole=name in arguments[:1]),
             ),
         ]

@@ -17,9 +17,9 @@ from typing import Any, Literal
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.system import addresses, machine
-from dipn_jax.system.interruption import STOPS
+from dipn_jax.system.interruption import STOP_SIGNALS
 
-AHEAD = 2
+SUBMITTED_PER_SLOT = 2
 """Tasks that are submitted for each one that the cluster can run at a time."""
 ANSWERS_WITHIN = 20.0
 """Seconds within which a cluster has to accept a connection."""
@@ -121,14 +121,14 @@ def _attempt(function: Callable[..., Any], task: tuple[Any, ...]) -> tuple[Any, 
 
 
 def _window(ray: Any, launch: Launch) -> int:
-    """Return how many tasks are submitted at a time, so that no machine waits for one and the cluster keeps few."""
+    """Return how many tasks are submitted at a time: enough that no machine waits, few for the cluster to keep."""
     there = ray.cluster_resources()
     asked = [(there.get("CPU", 0.0), launch.num_cpus), (there.get("GPU", 0.0), launch.num_gpus)]
-    return max(AHEAD, AHEAD * int(min(has / need for has, need in asked if need)))
+    return max(SUBMITTED_PER_SLOT, SUBMITTED_PER_SLOT * int(min(has / need for has, need in asked if need)))
 
 
 def _warn_of_too_little(ray: Any, launch: Launch) -> None:
-    """Say if no machine of the cluster has what a task needs: it then waits for one that has."""
+    """Warn if no machine of the cluster has what a task needs: the task then waits for one that has."""
     alive = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     needs = {"CPU": launch.num_cpus, "GPU": launch.num_gpus}
     if not any(all(node.get(name, 0.0) >= need for name, need in needs.items()) for node in alive):
@@ -159,7 +159,7 @@ def _connected() -> Iterator[Any]:
     if ray.is_initialized():
         yield ray
         return
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *STOPS)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *STOP_SIGNALS)}
     quiet = {"log_to_driver": False, "logging_level": "ERROR"}
     address = os.environ.get("RAY_ADDRESS")
     _require_answer(address)

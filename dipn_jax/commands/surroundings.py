@@ -1,4 +1,4 @@
-"""What a command is started with: the environment, open streams, the terminal; and what is made of them.
+"""Prepare a command's environment variables, streams and terminal.
 
 Importing this imports no JAX, which reads its settings from the environment when it is first imported.
 """
@@ -14,7 +14,7 @@ import sys
 
 from dipn_jax.system import typed
 
-SETTINGS = (
+IGNORED_JAX_SETTINGS = (
     "JAX_DEFAULT_DTYPE_BITS",
     "JAX_DEFAULT_MATMUL_PRECISION",
     "JAX_DEFAULT_PRNG_IMPL",
@@ -39,8 +39,8 @@ NARROWEST = 40
 """Columns that help and messages take at least; with a few, drawing their frames takes for ever."""
 
 
-def settle() -> str | None:
-    """Make the environment what commands need, and return in one line which settings of it are ignored, if any.
+def set_environment() -> str | None:
+    """Set environment variables for a command; return one line on the ignored JAX settings, None if there are none.
 
     Settings of packages that have been imported already are left alone.
     """
@@ -50,7 +50,7 @@ def settle() -> str | None:
         os.environ["MUJOCO_GL"] = "disable"
     if "jax" in sys.modules:
         return None
-    there = {name: os.environ.pop(name) for name in SETTINGS if name in os.environ}
+    there = {name: os.environ.pop(name) for name in IGNORED_JAX_SETTINGS if name in os.environ}
     return f"{_shown(there)}: ignored, because results would differ or fail" if there else None
 
 
@@ -93,7 +93,7 @@ def trouble(error: Exception) -> str | None:
 
 
 def _not_imported(error: Exception) -> str | None:
-    """Return why JAX cannot be imported, with its settings: most often one of them is none that it knows."""
+    """Return why JAX cannot be imported, with its settings: most often JAX does not know one of them."""
     ours = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
     try:
         import jax  # noqa: F401

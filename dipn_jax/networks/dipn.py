@@ -23,7 +23,7 @@ EXTRA_CENTIMETRES = 2
 class DipnConfig:
     """Architecture. `paper` is as published; `compact` trains on a laptop's CPU."""
 
-    preset: str = "compact"
+    preset: str = "compact"  # or paper
     stages: tuple[int, ...] = (3, 4, 6, 3)  # paper: ResNet-50; the released code has (2, 2, 2, 2)
     width: int = 24  # compact: channels of the first stage
     features: int = 128  # compact: size of the features of an object, a scene and an interaction

@@ -32,7 +32,7 @@ CELL_PIXELS = 4
 class GraspConfig:
     """Architecture. `paper` is as published; `compact` scores 16 rotations in a fraction of a second on a CPU."""
 
-    preset: str = "compact"
+    preset: str = "compact"  # or paper
     stages: tuple[int, ...] = (3, 4, 6, 3)  # paper: ResNet-50
     width: int = 24  # compact: channels at stride 4
     coarse: int = 48  # compact: channels at stride 8

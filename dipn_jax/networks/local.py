@@ -109,7 +109,7 @@ def rough_means(
     *,
     turns: tuple[int, ...],
 ) -> Float[jax.Array, " P"]:
-    """Return about how much `turns` change the mean of all scores from the present image to each image.
+    """Return rough changes, due to rotations `turns`, of the mean score from the present image to each image.
 
     Args:
       network: GN, `compact`, in evaluation mode.

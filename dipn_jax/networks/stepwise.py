@@ -31,9 +31,9 @@ LARGEST_GAP = 0.06
 GAP_SCALE = 100
 """Factor of gaps (metres) before they go into the network, so that they are numbers of about 1."""
 OUTLINE_SCALE = 20
-"""Factor of outlines (metres) before they go into the network, for the same reason."""
+"""Factor of outlines (metres) before they go into the network, so that they are numbers of about 1."""
 PLACE_SCALE = 10
-"""Factor of positions (metres) before they go into the network, for the same reason."""
+"""Factor of positions (metres) before they go into the network, so that they are numbers of about 1."""
 MOTION_SCALE = 2.0
 """Factor of the network's output: pixels and degrees of a typical centimetre of motion."""
 _NORMALS = push_frame.directions()

@@ -14,7 +14,7 @@ from dipn_jax.networks import resnet
 from dipn_jax.networks.grasp import INPUT_SCALE, GraspConfig, GraspNet
 from dipn_jax.sight import render
 
-PARTS = ("push", "grasp")
+NETWORK_PARTS = ("push", "grasp")
 """Parts that a network may have, one for each primitive."""
 GROWTH_RATE = 32
 """Channels that a layer of a DenseNet adds."""
@@ -24,17 +24,17 @@ GROWTH_RATE = 32
 class VpgConfig:
     """Architecture. `paper`: two DenseNet-121 trunks a primitive; `compact`: GN's trunk for each."""
 
-    preset: str = "compact"
-    parts: tuple[str, ...] = PARTS
+    preset: str = "compact"  # or paper
+    parts: tuple[str, ...] = NETWORK_PARTS
     answers: str = "value"  # or chance: a probability
     blocks: tuple[int, ...] = (6, 12, 24, 16)  # paper: DenseNet-121
     width: int = 24  # compact: as GraspConfig
-    coarse: int = 48
+    coarse: int = 48  # compact: as GraspConfig
 
     def __post_init__(self) -> None:
         if self.preset not in ("paper", "compact"):
             raise UserError(f"VPG network: preset {self.preset!r}; want paper or compact")
-        if not self.parts or set(self.parts) - set(PARTS):
+        if not self.parts or set(self.parts) - set(NETWORK_PARTS):
             raise UserError(f"VPG network: parts {self.parts}; want push, grasp or both")
         if self.answers not in ("value", "chance"):
             raise UserError(f"VPG network: answers {self.answers!r}; want value or chance")

@@ -26,7 +26,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.physics import cone
 from dipn_jax.structs import Array, Pytree
 
-SIZE = 6
+BLOCK_DOFS = 6
 """Degrees of freedom of a block."""
 CAPACITIES = ((8, 80), (15, 112))
 """Blocks and contacts of a scene that there are kernels for: 7 objects, and the most whose shared memory is static."""
@@ -145,7 +145,7 @@ def _call(blocks: int, contacts: int, rows: int, equalities: int, iterations: in
         kernel,
         num_outputs=2,
         launch_dims=(1, native.LANES),
-        output_dims={"acceleration": SIZE * blocks, "steps": 1},
+        output_dims={"acceleration": BLOCK_DOFS * blocks, "steps": 1},
         block_dim=native.LANES,
     )
     return jax.jit(lambda *leaves: call(*leaves, *numbers))
@@ -160,8 +160,8 @@ def _sides(m: Any) -> np.ndarray:
         while line[-1]:
             line.append(parent[line[-1]])
         dofs = np.flatnonzero(np.isin(dof_body, line))
-        bits = [1 << place for place in dofs % SIZE - SIZE // 2 if place >= 0]
-        code[body] = 8 * (dofs[0] // SIZE) + sum(bits) if len(dofs) else -1
+        bits = [1 << place for place in dofs % BLOCK_DOFS - BLOCK_DOFS // 2 if place >= 0]
+        code[body] = 8 * (dofs[0] // BLOCK_DOFS) + sum(bits) if len(dofs) else -1
     return code[np.asarray(m.geom_bodyid)].astype(np.int32)
 
 
@@ -172,7 +172,7 @@ def _rows(m: Any, d: Any) -> tuple[jax.Array, jax.Array, jax.Array, int]:
     k, b, imp = jax.vmap(lambda *args: constraint._kbi(m, *args))(efc.solref, efc.solimp, efc.pos_imp)
     resistance = jnp.maximum(efc.invweight * (1 - imp) / imp, mujoco.mjMINVAL)
     goal = -b * (efc.J @ d.qvel) - k * imp * efc.pos_aref
-    return efc.J[:, :SIZE], goal, 1 / resistance, len(found[0].pos_aref)
+    return efc.J[:, :BLOCK_DOFS], goal, 1 / resistance, len(found[0].pos_aref)
 
 
 def problem(m: Any, d: Any) -> Problem:
@@ -184,23 +184,23 @@ def problem(m: Any, d: Any) -> Problem:
       m: MJX model as for `cone.solve`, with the gripper's six degrees of freedom and six an object.
       d: its data, up to `forward.fwd_acceleration`.
     """
-    contact, blocks = d._impl.contact, m.nv // SIZE
+    contact, blocks = d._impl.contact, m.nv // BLOCK_DOFS
     row, goal, weight, equalities = _rows(m, d)
     distance = contact.dist - contact.includemargin
     k, b, imp = jax.vmap(lambda *args: constraint._kbi(m, *args))(contact.solref, contact.solimp, distance)
     light = m.body_invweight0[jnp.asarray(m.geom_bodyid)[contact.geom], 0].sum(-1)  # of both bodies
     resistance = jnp.maximum(light * (1 - imp) / imp, mujoco.mjMINVAL)
     mu = contact.friction[:, 0] / jnp.sqrt(m.opt.impratio)
-    mass = support.full_m(m, d).reshape(blocks, SIZE, blocks, SIZE)
+    mass = support.full_m(m, d).reshape(blocks, BLOCK_DOFS, blocks, BLOCK_DOFS)
     each = np.arange(blocks)
-    first_body = np.asarray(m.dof_bodyid)[::SIZE]
+    first_body = np.asarray(m.dof_bodyid)[::BLOCK_DOFS]
     return Problem(
         mass=mass[each, :, each],
         free=d.qacc_smooth,
         force=d.qfrc_smooth,
         velocity=d.qvel,
         center=d.subtree_com[np.asarray(m.body_rootid)[first_body]],
-        axes=d.cdof.reshape(blocks, SIZE, SIZE)[:, SIZE // 2 :],
+        axes=d.cdof.reshape(blocks, BLOCK_DOFS, BLOCK_DOFS)[:, BLOCK_DOFS // 2 :],
         row=row,
         row_goal=goal,
         row_weight=weight,
@@ -227,5 +227,5 @@ def solve(m: Any, d: Any) -> Any:
     """
     p = problem(m, d)
     a, _ = minimize(p, d.qacc_warmstart, int(m.opt.iterations), int(m.opt.ls_iterations))
-    force = jnp.einsum("bij,bj->bi", p.mass, a.reshape(-1, SIZE)).reshape(-1) - p.force
+    force = jnp.einsum("bij,bj->bi", p.mass, a.reshape(-1, BLOCK_DOFS)).reshape(-1) - p.force
     return d.tree_replace({"qacc": a, "qfrc_constraint": force})

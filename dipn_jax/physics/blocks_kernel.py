@@ -16,7 +16,7 @@ LANES = 32
 """Threads that share a scene: a warp."""
 MOST_ROWS = 4
 """Equalities and limits that there is room for."""
-_PARTS = ("blocks_cost.h", "blocks_newton.h")
+_SOURCE_FILES = ("blocks_cost.h", "blocks_newton.h")
 
 
 def _source(blocks: int, contacts: int) -> str:
@@ -32,7 +32,7 @@ def _source(blocks: int, contacts: int) -> str:
     rooms = f"enum {{ BLOCKS = {blocks}, CONTACTS = {contacts}, ROWS = {MOST_ROWS} }};\n"
     lines = [f"constexpr float {name} = {float(value)!r}f;\n" for name, value in numbers.items()]
     here = pathlib.Path(__file__)
-    return rooms + "".join(lines) + "".join(here.with_name(part).read_text(encoding="utf-8") for part in _PARTS)
+    return rooms + "".join(lines) + "".join(here.with_name(part).read_text(encoding="utf-8") for part in _SOURCE_FILES)
 
 
 @functools.cache

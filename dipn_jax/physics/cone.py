@@ -60,7 +60,7 @@ class _Problem(Pytree):
 
 @flax.struct.dataclass
 class _Reach(Pytree):
-    """Places of residuals `u [C, K]` with respect to their cones."""
+    """Where residuals `u [C, K]` lie relative to their cones."""
 
     away: jax.Array  # [C, K] from the nearest point of the cone to u
     below: jax.Array  # [C] bool: the nearest point is the tip

@@ -98,6 +98,6 @@ def codes(
         (Fault.OUTSIDE, outside.any(-1)),
         (Fault.SPEED, top > MAX_SPEED),
         (Fault.PENETRATION, sunk.any(-1) | (depth > MAX_SINK) | (deepest > MAX_DEPTH)),
-        (Fault.SHORT, ~((off_path(hand, target, xp=xp) <= MAX_MISS) & (stray <= MAX_STRAY))),
+        (Fault.GRIPPER_SHORT, ~((off_path(hand, target, xp=xp) <= MAX_MISS) & (stray <= MAX_STRAY))),
     )
     return sum((xp.where(where, bit, 0) for bit, where in flags), xp.zeros(len(present), xp.int32))

@@ -159,7 +159,7 @@ def unpack(qpos: np.ndarray, poses: np.ndarray, slots: np.ndarray, present: np.n
 
 
 def hold_in(sims: Worlds, mass: np.ndarray, *, up: bool) -> None:
-    """Apply the fence's forces for the next control period; none once it is no longer up."""
+    """Apply the fence's forces for the next control period; none after it has been taken away."""
     shape = mass.shape
     position = np.asarray(sims.qpos)[:, GRIPPER_DOF:].reshape(*shape, 7)[..., :2]
     velocity = np.asarray(sims.qvel)[:, GRIPPER_DOF:].reshape(*shape, 6)[..., :2]

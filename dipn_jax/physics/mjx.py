@@ -33,7 +33,7 @@ DEFAULTS = PhysicsConfig(
 PADDED_KEY_FRAMES = 8
 """Key frames that every trajectory is padded to, so that all primitives share one program."""
 PADDED_SAMPLES = 12
-"""Sampled instants that every request is padded to, for the same reason."""
+"""Sampled instants that every request is padded to, so that all primitives share one program."""
 
 
 class MjxEngine:

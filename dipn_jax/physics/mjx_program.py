@@ -25,7 +25,7 @@ from dipn_jax.world.scenes import parked
 
 
 def _adapt(spec: mujoco.MjModel) -> None:
-    """Change what the MJCF says that would cost MJX time and gain nothing."""
+    """Change settings of the MJCF that would cost MJX time without any gain."""
     # MJX keeps `contact_points` rows for each condim: with the pads at 4 the solver has 2.5 times the rows and a step
     # takes 1.6 times as long, for a torsional friction that the several contacts of a pad have without it
     spec.geom_condim[spec.geom_condim == 4] = 3
@@ -43,7 +43,7 @@ class Program:
         _adapt(spec)
         self.base = mjx.put_model(spec, impl="jax")
         self.data = mjx.make_data(self.base)
-        self.first_geom, self.first_body = spec.ngeom - slots * shapes.PARTS, spec.nbody - slots
+        self.first_geom, self.first_body = spec.ngeom - slots * shapes.CONVEX_PARTS, spec.nbody - slots
         groups = collision_driver._geom_groups(self.base)
         self.culled = [
             np.array(pairs)[:, :2]
@@ -129,7 +129,7 @@ class Program:
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), parts)
         mass = jnp.where(present, scene.mass, 0.1)
         inertia = jnp.where(present[:, None], jax.vmap(shapes.inertia)(scene.shape, scene.size, mass), 1e-4)
-        mu = jnp.where(present, scene.friction, 1.0).repeat(shapes.PARTS)
+        mu = jnp.where(present, scene.friction, 1.0).repeat(shapes.CONVEX_PARTS)
         g, b = slice(self.first_geom, None), slice(self.first_body, None)
         still = jnp.array([1.0, 0.0, 0.0, 0.0])
         light = jnp.stack([1 / mass, (1 / inertia).mean(-1)], -1)  # inverse weights: translation, rotation

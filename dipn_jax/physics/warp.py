@@ -29,22 +29,22 @@ from dipn_jax.world.scenes import parked
 
 DEFAULTS = PhysicsConfig()
 """Settings of the solver unless others are given."""
-CHUNK = 512
+SCENES_AT_ONCE = 512
 """Maximum number of scenes simulated at once on a CPU."""
-CHUNK_ON_GPU = 2048
+SCENES_AT_ONCE_ON_GPU = 2048
 """Maximum number of scenes simulated at once on a GPU. An H200 simulates 209 scene seconds a second with 512 and 353
 with 2,048 (docs/benchmarks.md); more were not tried."""
 
 
 class Room(NamedTuple):
-    """How much there is room for, times the objects of the fullest scene and the gripper.
+    """Room in memory for each object of the fullest scene, and as much for the gripper.
 
     All scenes of a batch share their contacts and pairs; each has its own rows. Seen (`python -m benchmarks
     engines.warp_room`): at most 13 contacts, 2.5 pairs and 44 rows with one object, which a grasp presses on the
     table, and 8.8, 1.3 and 30 with three and more.
     """
 
-    contacts: int = 16
+    contacts: int = 16  # between any two geoms, the table and the gripper included
     pairs: int = 4  # of convex parts that touch, the table not counted
     rows: int = 64  # of constraints: three a contact
 
@@ -86,7 +86,7 @@ class WarpEngine:
 
         Args:
           config: solver settings; the control period must be a whole number of time steps.
-          chunk: most scenes simulated at once; if not given, CHUNK or CHUNK_ON_GPU.
+          chunk: most scenes simulated at once; if not given, SCENES_AT_ONCE or SCENES_AT_ONCE_ON_GPU.
           jacobian: `dense`, `sparse`, or `auto`: sparse above MOST_DENSE_DOF degrees of freedom, as of five objects.
           room: see `Room`; what does not fit is left out, and a fault.
           awake: for tables at rest, not for drops: objects begin asleep, and at most this many of a scene can be awake
@@ -111,7 +111,7 @@ class WarpEngine:
         self.device = self.warp.get_preferred_device()  # the first GPU, or else the CPU
         self.iterations = Iterations(0.0, 0.0, 0)
         self._worlds: Worlds | None = None  # the last ones, for the next that are as many
-        self.chunk = self.batch = chunk or (CHUNK_ON_GPU if self.device.is_cuda else CHUNK)
+        self.chunk = self.batch = chunk or (SCENES_AT_ONCE_ON_GPU if self.device.is_cuda else SCENES_AT_ONCE)
 
     def simulate(
         self,

@@ -58,7 +58,7 @@ def kernels() -> types.SimpleNamespace:
         qvel: wp.array2d[float],
         force: wp.array2d[float],
     ):
-        """Apply the fence's forces along x and y for the next period; none once it is no longer up."""
+        """Apply the fence's forces along x and y for the next period; none after it has been taken away."""
         world, slot, k = wp.tid()
         at = wp.float64(qpos[world, wp.static(dof) + 7 * slot + k])
         edge, fast = wp.float64(wp.static(reach)), wp.float64(wp.static(rate))
@@ -100,7 +100,7 @@ def kernels() -> types.SimpleNamespace:
                 off[world, k] = apart
 
     @wp.kernel(enable_backward=False)
-    def dive(
+    def note_depth(
         tick: wp.array[int],
         since: wp.array[wp.float64],
         contacts: wp.array[int],
@@ -108,7 +108,7 @@ def kernels() -> types.SimpleNamespace:
         distance: wp.array[float],
         deepest: wp.array[float],
     ):
-        """Note the deepest contact of each world, from the time on when depth counts."""
+        """Record each world's deepest contact, from when depth counts."""
         i = wp.tid()
         counts = wp.float64(tick[0]) * wp.float64(wp.static(period)) >= since[0]
         if i < contacts[0] and counts and distance[i] < 0.0:
@@ -119,4 +119,6 @@ def kernels() -> types.SimpleNamespace:
         """Count a control period."""
         tick[0] = tick[0] + 1
 
-    return types.SimpleNamespace(steer=steer, hold_in=hold_in, count=count, watch=watch, dive=dive, advance=advance)
+    return types.SimpleNamespace(
+        steer=steer, hold_in=hold_in, count=count, watch=watch, note_depth=note_depth, advance=advance
+    )

@@ -94,8 +94,8 @@ def compiled(slots: int, config: PhysicsConfig, jacobian: mujoco.mjtJacobian) ->
 
 
 def kinds(scenes: Scene) -> Int[np.ndarray, "B M"]:
-    """Return which of KINDS each part of each slot of `scenes [B, N]` is, -1 where there is none; M is N PARTS."""
-    index = np.full((len(shapes.CLASSES), shapes.PARTS), -1, np.int32)
+    """Return which of KINDS each part of each slot of `scenes [B, N]` is, -1 where none is; M is N CONVEX_PARTS."""
+    index = np.full((len(shapes.CLASSES), shapes.CONVEX_PARTS), -1, np.int32)
     index[shapes.CORNERS_USED > 0] = np.arange(len(KINDS))  # in the same order
     found = np.where((scenes.shape >= 0)[..., None], index[np.maximum(scenes.shape, 0)], -1)
     return found.reshape(len(found), -1)
@@ -133,11 +133,12 @@ def scene_fields(
     """
     batch, slots = scenes.shape.shape
     present = scenes.shape >= 0
-    mass, mu = np.where(present, scenes.mass, 0.1), np.where(present, scenes.friction, 1.0).repeat(shapes.PARTS, -1)
+    mass = np.where(present, scenes.mass, 0.1)
+    mu = np.where(present, scenes.friction, 1.0).repeat(shapes.CONVEX_PARTS, -1)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), scenes)
     inertia = model.inertias(flat).reshape(*present.shape, 3)
     light = np.stack([1 / mass, (1 / inertia).mean(-1)], -1)  # inverse weights: translation, rotation
-    geoms, bodies = slice(spec.ngeom - slots * shapes.PARTS, None), slice(spec.nbody - slots, None)
+    geoms, bodies = slice(spec.ngeom - slots * shapes.CONVEX_PARTS, None), slice(spec.nbody - slots, None)
     mesh = np.where(kind >= 0, np.arange(kind.size).reshape(kind.shape), -1)
     changes: dict[str, tuple[tuple[slice | int, ...], np.ndarray]] = {
         **{name: ((geoms,), value) for name, value in _outlines(kind, size).items()},

@@ -73,7 +73,7 @@ class Worlds:
     def load(self, scenes: Scene) -> None:
         """Put other scenes of the same number and slots into the model."""
         self.scenes = scenes
-        kind, size = warp_model.kinds(scenes), np.repeat(scenes.size, shapes.PARTS, 1)
+        kind, size = warp_model.kinds(scenes), np.repeat(scenes.size, shapes.CONVEX_PARTS, 1)
         warp_model.put(self.warp, self.model, warp_model.mesh_fields(kind, size))
         warp_model.put(self.warp, self.model, warp_model.scene_fields(self.spec, scenes, kind, size))
         self.mass.assign(np.where(scenes.shape >= 0, scenes.mass, 0.0).astype(np.float64))
@@ -81,7 +81,7 @@ class Worlds:
     def run(
         self, scenes: Scene, qpos: np.ndarray, paths: Trajectory, instants: np.ndarray, fence: float
     ) -> list[np.ndarray]:
-        """Simulate from rest at `qpos [B, 6 + 7 N]`; return that of all `instants` (seconds).
+        """Simulate from rest at `qpos [B, 6 + 7 N]`; return the positions at all `instants` (seconds).
 
         Raises:
           Stopped: the engine was stopped.
@@ -158,7 +158,7 @@ class Worlds:
             launch(do.count, worlds, [data.solver_niter, self.histogram])
         launch(do.watch, worlds, [*paths, data.qpos, data.qvel, self.fastest, self.off])
         contact = [data.nacon, data.contact.worldid, data.contact.dist, self.deepest]
-        launch(do.dive, data.naconmax, [self.tick, self.since, *contact])
+        launch(do.note_depth, data.naconmax, [self.tick, self.since, *contact])
         launch(do.advance, 1, [self.tick])
 
     def watched(self) -> hosted.Watch:

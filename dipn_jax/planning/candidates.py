@@ -189,9 +189,9 @@ def best_grasp(scores: Float[Array, "R H W"]) -> tuple[Int[jax.Array, " 3"], Flo
 def grasp_from_top(
     scores: Float[Array, "R H W"], height: Float[Array, "H W"], margin: Float[Array, ""] | float
 ) -> tuple[Int[jax.Array, " 3"], Float[jax.Array, ""]]:
-    """Return the index `[3]` of the best grasp of the highest thing on which one scores nearly best, and its score.
+    """Of the grasps within `margin` of the best, return the best on the highest object: index `[3]` and score.
 
-    What lies under something else is then not pulled from under it.
+    So an object is not pulled from under another.
 
     Args:
       scores: `[16, H, W]`.

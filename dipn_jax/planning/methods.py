@@ -18,7 +18,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.names import Aid, MethodName
 from dipn_jax.networks import vpg
 from dipn_jax.planning import acts, outlook, planner, predictors, scorers
-from dipn_jax.planning.acts import Act
+from dipn_jax.planning.acts import DecideFunction
 from dipn_jax.planning.planner import Predictor, Rule, Scorer, ScoreSummary
 from dipn_jax.planning.policy_config import DEFAULT_CONFIG, PolicyConfig
 from dipn_jax.sight import observed
@@ -27,6 +27,7 @@ from dipn_jax.structs import Array, Decision, Observation
 from dipn_jax.system import forking
 
 NetworkRole = Literal["push", "grasp", "value"]
+"""What a network does in a method: predict pushes (DIPN), score grasps (GN), or value actions (compared methods)."""
 ROLES: dict[NetworkRole, tuple[str, str]] = {
     "push": ("dipn", "push"),
     "grasp": ("grasp", "grasp"),
@@ -39,10 +40,10 @@ ROLES: dict[NetworkRole, tuple[str, str]] = {
 class Policy:
     """A method with its networks, ready to decide: observation in, decision out.
 
-    `act` is compiled once; policies that differ in rule or distances only share it (`with_config`).
+    `decide_function` is compiled once; policies that differ in rule or distances only share it (`with_config`).
     """
 
-    act: Act
+    decide_function: DecideFunction
     rule: Rule
     distances: Float[Array, " P"]  # metres, of the candidates
 
@@ -64,7 +65,7 @@ class Policy:
             forking.check()
             observed.check_observation(observation)
             observed.require_reach(observation)
-        return self.act(key, observation, missed, self.rule, self.distances)
+        return self.decide_function(key, observation, missed, self.rule, self.distances)
 
     def with_config(self, config: PolicyConfig) -> Policy:
         """Return a policy of the same networks with another rule and other distances; as many candidates as before."""
@@ -178,8 +179,8 @@ def _of_shipped(
 
 def grasping_policy(scorer: Scorer, config: PolicyConfig = DEFAULT_CONFIG) -> Policy:
     """Return the policy that grasps where `scorer` is highest, and never pushes."""
-    act = acts.imagining(predictors.static_predictor, scorer, None)
-    return Policy(act, config.rule().replace(grasp_above=-1.0), np.array([0.1], np.float32))
+    decide = acts.decide_by_imagining(predictors.static_predictor, scorer, None)
+    return Policy(decide, config.rule().replace(grasp_above=-1.0), np.array([0.1], np.float32))
 
 
 def gn_scores(run: pathlib.Path, config: PolicyConfig) -> tuple[Scorer, ScoreSummary]:
@@ -196,36 +197,36 @@ def _predictor(runs: Runs, config: PolicyConfig) -> Predictor:
 
 
 def _dipn_gn(runs: Runs, config: PolicyConfig) -> Policy:
-    act = acts.imagining(_predictor(runs, config), *gn_scores(runs["grasp"], config))
-    return Policy(act, config.rule(), config.spread())
+    decide = acts.decide_by_imagining(_predictor(runs, config), *gn_scores(runs["grasp"], config))
+    return Policy(decide, config.rule(), config.spread())
 
 
 def _dipn_gn_actions(runs: Runs, config: PolicyConfig) -> Policy:
     scorer, summarize = gn_scores(runs["grasp"], config)
     estimate = outlook.misses_to_come(scorer)
-    act = acts.imagining(_predictor(runs, config), scorer, summarize, estimate=estimate)
-    return Policy(act, config.rule(), config.spread())
+    decide = acts.decide_by_imagining(_predictor(runs, config), scorer, summarize, estimate=estimate)
+    return Policy(decide, config.rule(), config.spread())
 
 
 def _rea_dipn(runs: Runs, config: PolicyConfig) -> Policy:
     table = "table" in config.aids
     summary = scorers.load_summary(runs["value"], network="vpg", whole=config.released, table=table)
-    act = acts.imagining(_predictor(runs, config), _chances(runs["value"], config.aids), summary)
-    return Policy(act, config.rule(), config.spread())
+    decide = acts.decide_by_imagining(_predictor(runs, config), _chances(runs["value"], config.aids), summary)
+    return Policy(decide, config.rule(), config.spread())
 
 
 def _dqn_gn(runs: Runs, config: PolicyConfig) -> Policy:
     scorer = scorers.load_scorer(runs["grasp"], aids=config.aids)
-    plain = scorers.load_plain_scorer(runs["grasp"], table="table" in config.aids)
-    act = acts.by_value(_part(runs["value"], "push"), scorer, plain, grasp_at_once=True)
-    return Policy(act, config.rule(), config.spread())
+    network_scores = scorers.load_plain_scorer(runs["grasp"], table="table" in config.aids)
+    decide = acts.decide_by_values(_part(runs["value"], "push"), scorer, network_scores, grasp_at_once=True)
+    return Policy(decide, config.rule(), config.spread())
 
 
 def _vpg(runs: Runs, config: PolicyConfig) -> Policy:
     pushes, grasps = _part(runs["value"], "push"), _part(runs["value"], "grasp", config.aids)
     table: tuple[Aid, ...] = ("table",) if "table" in config.aids else ()
-    act = acts.by_value(pushes, grasps, _part(runs["value"], "grasp", table), grasp_at_once=False)
-    return Policy(act, config.rule(), config.spread())
+    decide = acts.decide_by_values(pushes, grasps, _part(runs["value"], "grasp", table), grasp_at_once=False)
+    return Policy(decide, config.rule(), config.spread())
 
 
 def _gn(runs: Runs, config: PolicyConfig) -> Policy:
@@ -252,7 +253,7 @@ def _part(run: pathlib.Path, name: str, aids: tuple[Aid, ...] = ()) -> Scorer:
     Raises:
       UserError: it was trained without.
     """
-    if (found := scorers.load_values(run, aids=aids)[vpg.PARTS.index(name)]) is None:
+    if (found := scorers.load_values(run, aids=aids)[vpg.NETWORK_PARTS.index(name)]) is None:
         raise UserError(f"--value-net {run}: was not trained to {name}; give a run of another --method")
     return found
 

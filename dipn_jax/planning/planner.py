@@ -45,6 +45,8 @@ class Rule(Pytree):
     """How Alg. 2 decides; every field is traced. The defaults are the paper's rule.
 
     Example:
+      from dipn_jax.planning.planner import Rule
+
       decision = dipn_jax.decide(key, observation, predictor, scorer, rule=Rule(gamma=0.8))
     """
 
@@ -55,10 +57,10 @@ class Rule(Pytree):
     edge_factor: Float[Array, ""] | float = 1.0
     draw_all: Bool[Array, ""] | bool = False  # draw also motions below UNDRAWN_SHIFT and UNDRAWN_TURN
     top_margin: Float[Array, ""] | float = 0.0  # see `candidates.grasp_from_top`
-    # clauses that only DIPN's released code has
-    grasp_lone: Bool[Array, ""] | bool = False  # a lone object is grasped
-    push_must_raise_best: Bool[Array, ""] | bool = False  # a push must raise the best score, too
-    # gamma discounts only pushes after which the best score is higher (released: 0.5)
+    grasp_lone: Bool[Array, ""] | bool = False  # released code only: a lone object is grasped
+    # released code only: a push must raise the best score, too
+    push_must_raise_best: Bool[Array, ""] | bool = False
+    # released code only (0.5): gamma discounts only pushes after which the best score is higher than this
     discount_above: Float[Array, ""] | float = 0.0
 
 
@@ -154,7 +156,7 @@ def decide_among(
 
 
 def _drawn(motion: Float[Array, "*b 3"], rule: Rule) -> Float[jax.Array, "*b 3"]:
-    """Return motions as they are drawn: small ones are none, unless the rule says otherwise."""
+    """Return motions as they are drawn: small ones are 0, unless the rule has `draw_all`."""
     small = jnp.linalg.norm(motion[..., :2], axis=-1) < UNDRAWN_SHIFT
     small &= jnp.abs(motion[..., 2]) < UNDRAWN_TURN
     return jnp.where(small[..., None] & ~jnp.asarray(rule.draw_all), 0.0, motion)
@@ -232,13 +234,13 @@ def decide(
     return _count_actions(decision, observation, jnp.asarray(missed), estimate, rule)
 
 
-@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer", "plain"))
+@functools.partial(jax.jit, static_argnames=("push_scorer", "scorer", "network_scores"))
 def decide_by_value(
     observation: Observation,
     push_scorer: Scorer,
     scorer: Scorer,
     *,
-    plain: Scorer | None = None,
+    network_scores: Scorer | None = None,
     distance: Float[Array, ""] | float,
     grasp_above: Float[Array, ""] | float = jnp.inf,
     top_margin: Float[Array, ""] | float = 0.0,
@@ -250,7 +252,8 @@ def decide_by_value(
       observation: what the camera sees now.
       push_scorer: values of pushes that start at each pixel in each of 16 directions.
       scorer: values of grasps, the best of which is chosen.
-      plain: values of grasps that are compared with those of pushes, where `scorer` lowers them; `scorer` by default.
+      network_scores: values of grasps that are compared with those of pushes, where `scorer` lowers them; `scorer`
+        by default.
       distance: push distance, metres.
       grasp_above: grasp at once if the best grasp's value by `scorer` is higher.
       top_margin: as of `Rule`.
@@ -262,7 +265,7 @@ def decide_by_value(
     image = render.rgbd(observation)
     known = candidates.discount_missed(scorer(image[None])[0], missed)
     pixel, score = candidates.grasp_from_top(known, observation.height, top_margin)
-    values = (plain or scorer)(image[None])[0]
+    values = (network_scores or scorer)(image[None])[0]
     grasp_value = candidates.discount_missed(values, missed)[tuple(pixel)]
     possible = fingers.pushable(observation.height)
     values = jnp.where(possible, push_scorer(image[None])[0], -jnp.inf)

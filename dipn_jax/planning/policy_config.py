@@ -25,18 +25,18 @@ class PolicyConfig:
       policy = dipn_jax.load_policy("dipn+gn", config=config)
 
     Raises:
-      UserError: no method could decide by an entry.
+      UserError: no method can use the value of a field.
     """
 
     candidates: int = 32  # pushes considered at a time
     distances: tuple[float, ...] = (0.10,)  # metres a push goes; of several, candidates take them in turn
-    gamma: float = 0.9
-    grasp_above: float = 0.7
+    gamma: float = 0.9  # discount of a push's value
+    grasp_above: float = 0.7  # grasp at once if the best score is higher
     released: bool = False  # with the clauses of DIPN's released code
-    aids: tuple[Aid, ...] = ALL_AIDS  # what no paper has; `memory` is for the caller, who gives the misses
+    aids: tuple[Aid, ...] = ALL_AIDS  # small rules of ours; the caller gives `memory` the misses
 
     def __post_init__(self) -> None:
-        """Raise a UserError for the first entry that no method could decide by."""
+        """Raise a UserError for the first field whose value no method can use."""
         if not isinstance(self.candidates, (int, np.integer)) or self.candidates < 1:
             raise UserError(f"PolicyConfig: candidates {self.candidates!r}; want a whole number above 0")
         if not self.distances or not all(0 < distance < LONGEST_PUSH + 1e-9 for distance in self.distances):

@@ -75,7 +75,7 @@ def value_scorers(model: vpg.VPG, *, aids: Collection[Aid] = TABLE_AID) -> tuple
     """
     chance = model.config.answers == "chance"
     squash, lowest = (nnx.sigmoid, 0.0) if chance else ((lambda x: x), -jnp.inf)
-    push, grasps = (getattr(model, name) if name in model.config.parts else None for name in vpg.PARTS)
+    push, grasps = (getattr(model, name) if name in model.config.parts else None for name in vpg.NETWORK_PARTS)
     score_push = functools.partial(grasp.score_image, action="push", squash=squash)
     score_grasp = functools.partial(grasp.aided_scores, aids=tuple(aids), squash=squash, lowest=lowest)
     return (

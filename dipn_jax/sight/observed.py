@@ -16,13 +16,13 @@ from dipn_jax.system import forking
 from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 
 F = TypeVar("F", bound=Callable[..., Any])
-LOWEST = -0.05
+MIN_HEIGHT = -0.05
 """Lowest height that is accepted (metres above the table)."""
-BARE = 0.1
+LOWEST_PIXEL_LIMIT = 0.1
 """Height in metres that some pixel must not exceed: a heap never covers the whole table."""
-HIGHEST = 1.0
+MAX_HEIGHT = 1.0
 """Highest height that is accepted (metres above the table); heights given in millimetres exceed it."""
-MOST_SLOTS = 4096
+MAX_SLOTS = 4096
 """Most object slots that are accepted: each takes memory."""
 
 
@@ -47,16 +47,16 @@ def check_observation(observation: Any) -> None:
     height = _map("height", observation.height, (side, side), np.floating, "metres above the table")
     color = _map("color", observation.color, (side, side, 3), np.floating, "RGB from 0 to 1")
     label = _map("label", observation.label, (side, side), np.signedinteger, f"object slots, {ABSENT} on the table")
-    if not isinstance(slots, (int, np.integer)) or not 1 <= slots <= MOST_SLOTS:
+    if not isinstance(slots, (int, np.integer)) or not 1 <= slots <= MAX_SLOTS:
         raise UserError(
-            f"observation.slots: {slots!r}; want how many objects there may be, a whole number from 1 to {MOST_SLOTS}"
+            f"observation.slots: {slots!r}; want how many objects there may be, a whole number from 1 to {MAX_SLOTS}"
         )
-    if height.max() > HIGHEST or height.min() < LOWEST:
+    if height.max() > MAX_HEIGHT or height.min() < MIN_HEIGHT:
         raise UserError(
             f"observation.height: {height.min():g} to {height.max():g}; want metres above the table, not millimetres "
             "and not the distance from the camera"
         )
-    if height.min() > BARE:
+    if height.min() > LOWEST_PIXEL_LIMIT:
         raise UserError(
             f"observation.height: at least {height.min():g} everywhere, so that no table is seen; want metres above "
             "the table, not the distance from the camera"

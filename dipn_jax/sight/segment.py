@@ -14,7 +14,7 @@ TABLE_HEIGHT = 0.006
 """Height in metres below which what is coloured like the table is table; a quarter of the lowest object."""
 SAME_COLOR = 22
 """Levels of 255 by which each channel of one object may differ from its median; palettes differ by more."""
-SMALLEST = 30
+MIN_REGION_PIXELS = 30
 """Size in pixels (120 mm^2) below which a region is a fragment of its neighbour."""
 _BRIDGED_PIXELS = 40  # pixels over which a hidden part is bridged: the widest object above
 _FRAGMENT_PIXELS = 4  # pixels over which a fragment goes to a neighbour
@@ -78,7 +78,7 @@ def _regions(image: np.ndarray, foreground: np.ndarray) -> np.ndarray:
         cv2.floodFill(image, closed, (int(col), int(row)), (0, 0, 0), level, level, flags)
         filled = closed[1:-1, 1:-1] == 2
         left[filled] = 0
-        if filled.sum() >= SMALLEST:
+        if filled.sum() >= MIN_REGION_PIXELS:
             regions[filled] = number
     return regions
 

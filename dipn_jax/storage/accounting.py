@@ -15,11 +15,11 @@ from typing import Any
 
 from dipn_jax.system import files, typed
 
-ASKED = "asked.json"
+REQUEST_FILE = "asked.json"
 """Name of the file with the command that makes a data set."""
-MOST_NAMED = 8
+MAX_SHARDS_NAMED = 8
 """Shards that a message names at most."""
-MOST_SHOWN = 4000
+MAX_COMMAND_CHARS = 4000
 """Characters of a command that a message shows at most."""
 NOT_RECORDED = "not recorded"
 """What stands for the kind of processor of a shard that does not say it."""
@@ -27,7 +27,7 @@ NOT_RECORDED = "not recorded"
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """What was asked for: shards of `shard_size` episodes, the last one of what is left."""
+    """Requested size of a data set; the last shard may be shorter."""
 
     episodes: int
     shard_size: int
@@ -43,7 +43,7 @@ class Asked:
 
 def note(folder: pathlib.Path, command: Sequence[str], *, of: int) -> None:
     """Keep the command that makes a data set, without `--out`, `--shard` and `--of`, and the number of workers."""
-    files.write_json(folder / ASKED, {"command": list(command), "of": of})
+    files.write_json(folder / REQUEST_FILE, {"command": list(command), "of": of})
 
 
 def command(folder: pathlib.Path) -> list[str] | None:
@@ -52,14 +52,14 @@ def command(folder: pathlib.Path) -> list[str] | None:
     Raises:
       UserError: the file that keeps them is damaged.
     """
-    path = folder / ASKED
+    path = folder / REQUEST_FILE
     if not path.exists():
         return None
     return ["dipn-datagen", *files.read_json(path, wanted={"command": [str]})["command"]]
 
 
 def asked(folder: pathlib.Path) -> Asked | None:
-    """Return what was asked for of a data set; None where its folder does not say it.
+    """Return the requested size of a data set; None where its folder does not say it.
 
     Raises:
       UserError: its configuration is damaged.
@@ -118,18 +118,18 @@ def missing(folder: pathlib.Path, held: Mapping[int, int]) -> str | None:
     number = want.shards() - len(there)
     if number <= 0:
         return None
-    gaps = [index for index in range(min(want.shards(), len(there) + MOST_NAMED + 1)) if index not in there]
-    named = ", ".join(str(index) for index in gaps[:MOST_NAMED])
-    more = f" and {number - MOST_NAMED} more" if number > MOST_NAMED else ""
+    gaps = [index for index in range(min(want.shards(), len(there) + MAX_SHARDS_NAMED + 1)) if index not in there]
+    named = ", ".join(str(index) for index in gaps[:MAX_SHARDS_NAMED])
+    more = f" and {number - MAX_SHARDS_NAMED} more" if number > MAX_SHARDS_NAMED else ""
     return (
         f"{folder}: {sum(of_these.values())} of {want.episodes} episodes, shard{'s' if number > 1 else ''} "
-        f"{named}{more} missing: run {_command(folder, gaps, every=number <= MOST_NAMED)}"
+        f"{named}{more} missing: run {_command(folder, gaps, every=number <= MAX_SHARDS_NAMED)}"
     )
 
 
 def _command(folder: pathlib.Path, gaps: Sequence[int], *, every: bool) -> str:
     """Return the command that makes the missing shards: of the one worker that they belong to, or without a worker."""
-    path = folder / ASKED
+    path = folder / REQUEST_FILE
     if not path.exists():
         return "the command that made it again"
     found = files.read_json(path, wanted={"command": [str], "of": typed.Whole(1)})
@@ -142,7 +142,7 @@ def _command(folder: pathlib.Path, gaps: Sequence[int], *, every: bool) -> str:
 
 def quoted(words: Sequence[str]) -> str:
     """Return a command on one line, as a shell reads it, in backticks."""
-    return f"`{typed.one_line(shlex.join(words), most=MOST_SHOWN)}`"
+    return f"`{typed.one_line(shlex.join(words), most=MAX_COMMAND_CHARS)}`"
 
 
 def makers(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -50,7 +50,7 @@ def read(path: pathlib.Path, wanted: Mapping[str, Form]) -> dict[str, np.ndarray
 
 
 def _check(name: str, array: np.ndarray, form: Form, sizes: dict[str, int]) -> None:
-    """Raise a Misfit if an array has not its form; `sizes` has the lengths that have a name and are known."""
+    """Raise a Misfit if an array does not have its form; `sizes` holds the known lengths by name."""
     lengths = [sizes.get(want) if isinstance(want, str) else want for want in form.shape]
     fits = len(lengths) == array.ndim and all(w in (None, h) for w, h in zip(lengths, array.shape, strict=True))
     if array.dtype.kind not in form.kinds or not fits:

@@ -27,7 +27,7 @@ from dipn_jax.networks import dipn, grasp, vpg
 from dipn_jax.storage import leaves, owner, quiet, stored_step
 from dipn_jax.system import files, forking, temporary, typed
 
-WANTED = (
+ACCEPTED_RUNS_TEXT = (
     "give a run (the --out of dipn-train), one step of it (RUN@STEP, RUN@best) or that step's folder "
     "(RUN/checkpoints/STEP)"
 )
@@ -112,7 +112,7 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
             raise
         raise UserError(
             f"{folder.parents[1]}: step {about['step']} cannot be saved ({reason}); earlier steps are whole; make "
-            "space and give the same command to go on"
+            "space and give the same command to continue"
         ) from None
     for marker in folder.rglob("commit_success.txt"):  # Orbax writes the present folder into it
         marker.write_bytes(b"Checkpoint commit was successful\n")
@@ -171,7 +171,7 @@ def _whole(folder: pathlib.Path) -> dict[str, Any] | None:
 
 
 def newest(run: pathlib.Path) -> tuple[pathlib.Path, dict[str, Any]] | None:
-    """Return the newest whole step of a run and its metadata, None if there is none; a damaged newer one is named."""
+    """Return the newest whole step of a run and its metadata, None if there is none; warn of a damaged newer one."""
     steps = _steps(run)
     for number, folder in enumerate(steps):
         meta = _whole(folder)
@@ -190,7 +190,7 @@ def _warn_once(text: str) -> None:
 
 
 def used(run: pathlib.Path) -> dict[str, Any] | None:
-    """Return step and digest (SHA-256 of the metadata, which has those of all files) of the step that a run loads."""
+    """Return number and digest of the step that a run loads: the SHA-256 of its metadata, which list those of files."""
     found = newest(run)
     return found and {"step": found[1]["step"], "digest": files.file_sha256(found[0] / "meta.json")}
 
@@ -248,7 +248,7 @@ def find(run: pathlib.Path, *, network: str) -> pathlib.Path:
 
 
 def _step(run: pathlib.Path, step: str) -> pathlib.Path:
-    """Return the folder of a step of a run by its number, or of the best as its newest whole step knows it."""
+    """Return the folder of a run's step by its number, or of the best step, which the newest whole one names."""
     steps = {int(folder.name): folder for folder in _steps(run)}
     kept = f"it has {', '.join(map(str, steps))}" if steps else "it has none"
     if step == "best":
@@ -278,10 +278,10 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     forking.check()
     run = find(files.not_empty(run), network=network)
     if not run.is_dir():
-        raise UserError(f"checkpoint {run}: no such folder; {WANTED}")
+        raise UserError(f"checkpoint {run}: no such folder; {ACCEPTED_RUNS_TEXT}")
     found = newest(run)
     if found is None:
-        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; {WANTED}, or train again")
+        raise UserError(f"checkpoint {run}: no whole step under checkpoints/; {ACCEPTED_RUNS_TEXT}, or train again")
     folder, meta = found
     if meta["network"] != network:
         raise UserError(f"checkpoint {run}: holds a {meta['network']} network, want {network}; give another run")

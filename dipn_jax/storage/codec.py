@@ -114,7 +114,7 @@ def decode(stored: Columns, specs: dict[str, dict[str, Any]], *, into: Columns |
 
 
 def rounded(struct: T, *, prefix: str = "") -> T:
-    """Return a batch as a shard gives it back: every value is the multiple of its quantum that would be stored.
+    """Return a batch rounded as a shard stores it.
 
     What is simulated from rounded values can be simulated again from what is stored, bit for bit.
 

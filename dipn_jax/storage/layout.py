@@ -109,7 +109,7 @@ def _kind_problem(name: str, column: Column, spec: dict[str, Any]) -> str:
 
 
 def _shape_problem(name: str, column: Column, spec: dict[str, Any], sizes: dict[str, int]) -> str:
-    """Return what is wrong with the shape of a column; `sizes` has the lengths that have a name and are known."""
+    """Return what is wrong with the shape of a column; `sizes` holds the known lengths by name."""
     shape = spec["shape"]
     lengths = [int(want) if want.isdecimal() else sizes.get(want) for want in column.shape]
     if len(shape) != len(lengths) or any(want not in (None, has) for want, has in zip(lengths, shape, strict=True)):

@@ -69,7 +69,7 @@ def forget(folder: pathlib.Path, names: Collection[str]) -> None:
 
 @contextlib.contextmanager
 def _turn(folder: pathlib.Path) -> Iterator[bool]:
-    """Wait until no other worker writes the manifest; say whether that can be known."""
+    """Wait until no other worker writes the manifest; yield whether that is certain, as files can be locked."""
     with (folder / ".lock").open("wb") as lock:
         try:
             if fcntl is not None:
@@ -83,7 +83,7 @@ def _turn(folder: pathlib.Path) -> Iterator[bool]:
 
 @functools.cache
 def _warn_of_no_locks(folder: pathlib.Path) -> None:
-    """Say once a process that workers cannot take turns."""
+    """Warn, once a process, that workers cannot take turns."""
     console.warn(f"{folder}: its file system has no locks; workers list their shards without taking turns")
 
 

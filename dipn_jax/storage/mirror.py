@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
-from dipn_jax.storage.accounting import ASKED
+from dipn_jax.storage.accounting import REQUEST_FILE
 from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.storage.objects import Bucket, Found
 from dipn_jax.system import addresses, files, temporary, typed
@@ -27,9 +27,9 @@ SHARDS = "shard-*.parquet"
 """Names of shards."""
 INDEX = ".objects.json"
 """Name of the file that says which object each file of a copy is."""
-AT_ONCE = 8
+PARALLEL_FETCHES = 8
 """Objects that are fetched at a time."""
-NOTED = 16
+OBJECTS_PER_INDEX_WRITE = 16
 """Objects after which the copy notes what it has, so that an interruption repeats no more."""
 _FORM = {str: {"size": typed.Whole(), "tag": str}}
 
@@ -70,7 +70,7 @@ def _copied(url: str) -> pathlib.Path:
     """Make the copy the same as what is at the URL, and return its folder."""
     bucket, folder = Bucket(url), folder_of(url)
     folder.mkdir(parents=True, exist_ok=True)
-    addresses.call(folder, url)
+    addresses.show_instead(folder, url)
     with _turn(folder):
         described = {name: found for name, found in bucket.list().items() if not _is_shard(name)}
         _fetch(bucket, folder, described)
@@ -90,17 +90,17 @@ def _is_shard(name: str) -> bool:
 
 
 def _fetch(bucket: Bucket, folder: pathlib.Path, there: Mapping[str, Found]) -> None:
-    """Fetch the objects of a data set that the copy does not have as they are."""
+    """Fetch the objects of a data set that the copy lacks, or has in another version."""
     known = _known(folder)
-    wanted = [name for name in there if _is_shard(name) or name in (CONFIG, ASKED, MANIFEST)]
+    wanted = [name for name in there if _is_shard(name) or name in (CONFIG, REQUEST_FILE, MANIFEST)]
     todo = [name for name in wanted if not _has(folder / name, known.get(name), there[name])]
     quiet = not any(map(_is_shard, todo))
     with (
         console.Progress("download", len(wanted), unit="files", done=len(wanted) - len(todo), quiet=quiet) as progress,
-        concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool,
+        concurrent.futures.ThreadPoolExecutor(PARALLEL_FETCHES) as pool,
     ):
-        for first in range(0, len(todo), NOTED):
-            some = todo[first : first + NOTED]
+        for first in range(0, len(todo), OBJECTS_PER_INDEX_WRITE):
+            some = todo[first : first + OBJECTS_PER_INDEX_WRITE]
             for name, got in zip(some, pool.map(bucket.get, some), strict=True):
                 if got is None:  # it is being made anew
                     (folder / name).unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from typing import Any
 from dipn_jax.errors import UserError
 from dipn_jax.system import typed
 
-SETTINGS = {
+CREDENTIAL_VARIABLES = {
     "s3": "AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_REGION; elsewhere than at Amazon AWS_ENDPOINT, too",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS",
     "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
@@ -28,7 +28,7 @@ FIRST_RETRIES = {"max_retries": 1, "retry_timeout": datetime.timedelta(seconds=2
 """
 NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")
 """Parts of the answers where there is no bucket."""
-MOST_SAID = 200
+MAX_MESSAGE_CHARS = 200
 """Characters of a reason that are shown at most."""
 
 
@@ -44,7 +44,7 @@ class Bucket:
     """What is below a URL. Threads may share it, forked processes may not."""
 
     def __init__(self, url: str, *, make: bool = False) -> None:
-        """Look whether it can be listed.
+        """Open what is below a URL, and check that it can be listed.
 
         Args:
           url: from `addresses.url`.
@@ -81,7 +81,7 @@ class Bucket:
         return None
 
     def create(self, name: str, data: bytes) -> bool:
-        """Write an object where there is none of that name, and return whether that was so: one writer wins."""
+        """Write an object unless there is one of that name; return whether it was written, so that one writer wins."""
         import obstore
 
         with self._said():
@@ -92,7 +92,7 @@ class Bucket:
         return True
 
     def put(self, name: str, data: bytes) -> None:
-        """Write an object, whatever was there of that name."""
+        """Write an object; one of that name is replaced."""
         import obstore
 
         with self._said():
@@ -113,7 +113,7 @@ class Bucket:
 
     @contextlib.contextmanager
     def _said(self) -> Iterator[None]:
-        """Turn whatever storage refuses into one line."""
+        """Turn any error of the storage into a UserError of one line."""
         import obstore
 
         try:
@@ -122,18 +122,18 @@ class Bucket:
             raise UserError(f"{self.url}: {self._why(error)}") from None
 
     def _why(self, error: Exception) -> str:
-        """Return what is wrong, and what to do."""
+        """Return what is wrong with the storage, and what to do."""
         text = str(error)
         answer = re.search("<Message>([^<]+)", text)
         first = answer[1] if answer else text.strip().split("\n")[0]
         if self.scheme == "file":
-            return f"cannot be used ({typed.one_line(first, most=MOST_SAID)}); give another folder"
+            return f"cannot be used ({typed.one_line(first, most=MAX_MESSAGE_CHARS)}); give another folder"
         if isinstance(error, FileNotFoundError) or any(part in text for part in NO_BUCKET):
             return "no such bucket; make it, or give another"
-        needs = f"the environment has to say {SETTINGS[self.scheme]}"
+        needs = f"the environment has to say {CREDENTIAL_VARIABLES[self.scheme]}"
         if any(part in text for part in NO_CREDENTIALS):
             return f"no credentials; {needs}"
-        return f"cannot be used ({typed.one_line(first, most=MOST_SAID)}); {needs}"
+        return f"cannot be used ({typed.one_line(first, most=MAX_MESSAGE_CHARS)}); {needs}"
 
 
 def _opened(url: str, *, make: bool, **options: Any) -> Any:

@@ -117,7 +117,7 @@ class Objects:
 
     def note(self, command: Sequence[str], *, of: int) -> None:
         accounting.note(self.folder, command, of=of)
-        self._bucket.put(accounting.ASKED, files.read_bytes(self.folder / accounting.ASKED))
+        self._bucket.put(accounting.REQUEST_FILE, files.read_bytes(self.folder / accounting.REQUEST_FILE))
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
         """As `Place.counts`: shards that the manifest does not list are fetched to be looked at."""
@@ -130,7 +130,7 @@ class Objects:
         todo = [name for name in names.values() if name not in self._entries]
         with (
             console.Progress("look", len(todo), unit="shards", quiet=len(todo) < SILENT_SHARDS) as progress,
-            concurrent.futures.ThreadPoolExecutor(mirror.AT_ONCE) as pool,
+            concurrent.futures.ThreadPoolExecutor(mirror.PARALLEL_FETCHES) as pool,
         ):
             for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
                 self._entries |= {name: entry} if entry else {}
@@ -164,7 +164,7 @@ class Objects:
             (self.folder / name).unlink(missing_ok=True)
 
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
-        """As `Place.list`; of workers that end at the same time, the last one's counts, and readers find the rest."""
+        """As `Place.list`; if workers end at the same time, the last manifest stays; readers find the other shards."""
         known = self._listed() | self._entries | dict(made)
         there = self._bucket.list()
         held = {name: known[name] for name in there if name in known and known[name]["bytes"] == there[name].size}
@@ -216,7 +216,7 @@ def opened(out: pathlib.Path) -> Iterator[Place]:
         yield Folder(out)
         return
     with tempfile.TemporaryDirectory(prefix="dipn-datagen-") as folder:
-        addresses.call(pathlib.Path(folder), url)
+        addresses.show_instead(pathlib.Path(folder), url)
         yield Objects(url, pathlib.Path(folder))
 
 

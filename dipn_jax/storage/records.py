@@ -28,7 +28,7 @@ Look = tuple[str, dict[str, Any] | None]
 
 
 def _look(path: pathlib.Path, entry: dict[str, Any]) -> Look:
-    """Return what is wrong with a shard that the manifest lists so, and its metadata where nothing is."""
+    """Check a shard against its manifest entry; return the problem, or '' and its metadata."""
     if not path.is_file():
         return "missing", None
     if path.stat().st_size != entry["bytes"]:
@@ -45,7 +45,7 @@ def _look(path: pathlib.Path, entry: dict[str, Any]) -> Look:
 
 
 def _look_through(path: pathlib.Path) -> Look:
-    """Return why a shard cannot be read to its end, and its metadata where it can."""
+    """Read a shard to its end; return the problem, or '' and its metadata."""
     if not path.is_file():
         return "missing", None
     try:
@@ -77,7 +77,7 @@ def examined(folder: pathlib.Path) -> tuple[Problems, str | None]:
 
 
 def _of_one_kind(looks: list[tuple[pathlib.Path, Look]]) -> list[tuple[pathlib.Path, Look]]:
-    """Return what was found of shards; those of another kind than most are wrong, as when they were copied there."""
+    """Mark shards of a minority kind as wrong, as when somebody copied them in."""
     kinds = [meta["kind"] for _, (_, meta) in looks if meta is not None]
     most = max(kinds, key=kinds.count, default=None)
     return [
@@ -112,7 +112,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def _judged(path: pathlib.Path, entry: dict[str, Any] | None) -> Look:
-    """Return what is wrong with a shard: it cannot be read to its end, or is not the one that the manifest lists."""
+    """Check that a shard is the one that the manifest lists, and read it to its end; return as `_look` does."""
     if entry is not None and (not path.is_file() or files.file_sha256(path) != entry["sha256"]):
         return "not the one that the manifest lists", None
     return _look_through(path)

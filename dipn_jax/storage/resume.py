@@ -71,7 +71,7 @@ class Partial:
         files.write_atomically(self.path, plain.dumps({"identity": self.identity, "code": self.code, "state": state}))
 
     def finish(self) -> None:
-        """Delete the state, once the results are written; also one that an earlier version kept and nothing reads."""
+        """Delete the kept state, and the `.pickle` of earlier versions, once results are written."""
         self.path.unlink(missing_ok=True)
         self.path.with_suffix(".pickle").unlink(missing_ok=True)
 

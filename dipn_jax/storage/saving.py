@@ -1,4 +1,4 @@
-"""Checkpoints of a run that are written in the background, while training goes on."""
+"""Checkpoints of a run that are written in the background, while training continues."""
 
 from __future__ import annotations
 

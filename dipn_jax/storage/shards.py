@@ -127,7 +127,10 @@ def _entry(episodes: int, size: int, sha256: str, kind: str, faults: dict[str, A
 
 @contextlib.contextmanager
 def _reading(path: pathlib.Path) -> Iterator[None]:
-    """Turn whatever goes wrong while a shard is read into one line: what a damaged file raises, its reader decides."""
+    """Turn any error while reading a shard into a DamagedShard of one line.
+
+    What is not the shard's fault, such as a disk that cannot be read, becomes a UserError.
+    """
     try:
         yield
     except UserError:

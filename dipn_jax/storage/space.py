@@ -16,7 +16,7 @@ import numpy as np
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 
-SPARE = 100e6
+FREE_DISK_BYTES = 100e6
 """Bytes that are left free on a disk."""
 
 
@@ -102,7 +102,7 @@ def require_room(folder: pathlib.Path, size: float, *, what: str) -> None:
       UserError: it has not; `what` says what for.
     """
     free = shutil.disk_usage(folder).free
-    if free < size + SPARE:
+    if free < size + FREE_DISK_BYTES:
         raise UserError(
             f"{folder}: {_shown(free)} are free, and {what} need {_shown(size)} and some to spare; make room and give "
             "the same command again, or give a larger --memory"

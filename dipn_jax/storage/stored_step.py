@@ -25,7 +25,7 @@ FORM = {
     "best?": {"step": typed.Whole(), "measure": str, "value": float},
 }
 """Form of `meta.json`; `best` says at which step of the run so far a measure was lowest, that step included."""
-LARGEST = 65_536
+MAX_CONFIG_NUMBER = 65_536
 """Largest number in a network's config."""
 
 
@@ -47,10 +47,10 @@ def config(cls: type, values: dict[str, Any]) -> Any:
 
 
 def _form(default: Any) -> typed.Form:
-    """Return the form of an option whose default is this."""
+    """Return the `typed` form that values of this default's type must fit."""
     if isinstance(default, tuple):
         return [_form(default[0])]
-    return typed.Whole(1, LARGEST) if type(default) is int else type(default)
+    return typed.Whole(1, MAX_CONFIG_NUMBER) if type(default) is int else type(default)
 
 
 _COUNTS_OF_LAYERS = ("stages", "blocks", "rounds")
@@ -109,7 +109,7 @@ def _stored(part: pathlib.Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _reading(part: pathlib.Path) -> Iterator[None]:
-    """Turn what goes wrong into one line: what is missing or damaged, Orbax and TensorStore say in many ways."""
+    """Turn any error while arrays are read into a UserError of one line: Orbax and TensorStore raise many kinds."""
     jax.devices()  # where there is none, the command says so; it is not the file's fault
     if not part.is_dir():
         exported = "dipn-train export writes none: start from it by --init, in another --out"

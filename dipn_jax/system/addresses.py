@@ -25,17 +25,17 @@ def url(place: pathlib.Path | str) -> str | None:
 
 
 def taken(hint: Any) -> bool:
-    """Return whether an option of this type takes a URL, too: it is a `Place`, or several."""
+    """Return whether an option of this type accepts URLs: it is a `Place`, or several."""
     return OR_URL in getattr(hint, "__metadata__", ()) or any(map(taken, typing.get_args(hint)))
 
 
-def call(folder: pathlib.Path, name: str) -> None:
-    """Show `name` instead of `folder` in messages: the folder is a copy of what has this name."""
-    _names[str(folder)] = name
+def show_instead(folder: pathlib.Path, url: str) -> None:
+    """From now on show this URL instead of its local copy, the folder, in messages."""
+    _names[str(folder)] = url
 
 
 def named(text: str) -> str:
-    """Return `text` with the names that `call` gave instead of their folders."""
+    """Return `text` with URLs in place of the folders that `show_instead` was given."""
     for folder, name in _names.items():
         text = text.replace(folder, name)
     return text

@@ -8,13 +8,13 @@ import sys
 import threading
 from typing import Any
 
-STOPS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name))
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name))
 """Signals that ask to stop as SIGINT does: a job manager's, a closed terminal's, a time limit's warning."""
 
 
 def stops() -> list[signal.Signals]:
-    """Return the signals of STOPS that are heeded: all, but none that is ignored because `nohup` asked for it."""
-    return [number for number in STOPS if signal.getsignal(number) != signal.SIG_IGN]
+    """Return the signals of STOP_SIGNALS that are heeded: all but those that are ignored, as `nohup` asks."""
+    return [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
 
 
 AGAIN_AFTER = 0.05
@@ -22,10 +22,10 @@ AGAIN_AFTER = 0.05
 
 
 class Stopping:
-    """A context in which SIGINT and the signals of STOPS raise KeyboardInterrupt.
+    """A context in which SIGINT and the signals of STOP_SIGNALS raise KeyboardInterrupt.
 
-    Where it is raised within a callback, as JAX has one at each garbage collection, Python prints it and goes on: then
-    the signal is sent again instead. Handlers stay in place at the end.
+    Where it is raised within a callback, as JAX has one at each garbage collection, Python prints it and
+    continues: then the signal is sent again instead. Handlers stay in place at the end.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class Stopping:
 
 
 class Interruption:
-    """A context in which the first SIGINT or signal of STOPS only sets `requested`; a second one acts as usual."""
+    """A context in which the first SIGINT or signal of STOP_SIGNALS only sets `requested`; a second acts as usual."""
 
     def __init__(self) -> None:
         self.requested = False

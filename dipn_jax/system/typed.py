@@ -68,7 +68,7 @@ def parse(text: str | bytes) -> Any:
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object; of a key that is there twice, Python would keep the last value without a word."""
+    """Return a JSON object; raise a ValueError for a key that is there twice, of which Python keeps the last value."""
     found = dict(pairs)
     if len(found) < len(pairs):
         keys = [key for key, _ in pairs]

@@ -18,7 +18,7 @@ from dipn_jax.system import files, typed
 from dipn_jax.workspace import LOWEST_TIP, WORKSPACE
 from dipn_jax.world import scenes, shapes
 
-LARGEST = 1e6
+MAX_ENTRY_NUMBER = 1e6
 """Largest number that an entry may have."""
 _OBJECT = {
     "size_mm": (float,) * 3,
@@ -162,6 +162,6 @@ def _numbers(values: Sequence[float]) -> Float[np.ndarray, " _"]:
     Raises:
       Misfit: one of them is too large.
     """
-    if max(map(abs, values)) > LARGEST:
-        raise typed.Misfit(f"{values} has a number above {LARGEST:g}")
+    if max(map(abs, values)) > MAX_ENTRY_NUMBER:
+        raise typed.Misfit(f"{values} has a number above {MAX_ENTRY_NUMBER:g}")
     return np.asarray(values, np.float32)

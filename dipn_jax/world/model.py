@@ -18,7 +18,7 @@ from dipn_jax.world import shapes
 MARK = "dipn_jax"
 """Name of a custom number in our MJCF that marks a model as ours (`physics.patches` looks for it)."""
 WARP_MARK = "dipn_jax_warp"
-"""Name of another, in models that the engine `mjx` is to solve by its Warp kernel (`PhysicsConfig.solver`)."""
+"""Name of a custom number in models that the engine `mjx` is to solve by its Warp kernel (`PhysicsConfig.solver`)."""
 GRIPPER_DOF = 6
 """Degrees of freedom of the gripper: x, y, z, yaw, two fingers. Each object follows with 7 qpos and 6 qvel."""
 OBJECT_FRICTION_RATIO = 0.5 / 0.35
@@ -77,7 +77,7 @@ def _object(scene: Scene, slot: int, generic: bool, inertia: np.ndarray) -> tupl
     name = shapes.CLASSES[max(shape, 0)]
     mu = float(scene.friction[slot]) * OBJECT_FRICTION_RATIO if present else 1.0
     geoms, assets = [], []
-    for part in range(shapes.PARTS):
+    for part in range(shapes.CONVEX_PARTS):
         corners = int(shapes.CORNERS_USED[max(shape, 0), part]) if present else 0
         common = f'name="o{slot}p{part}" friction="{mu:.9g} 0.005 0.0001"'
         if generic:
@@ -158,7 +158,7 @@ def mjcf(
     floor = []
     for i in range(n):
         mu = float(scene.friction[i]) if scene.shape[i] >= 0 else 1.0
-        for part in range(shapes.PARTS):
+        for part in range(shapes.CONVEX_PARTS):
             alive = scene.shape[i] >= 0 and shapes.CORNERS_USED[int(scene.shape[i]), part] > 0
             gap = "" if generic or alive else ' margin="-1000"'
             floor.append(

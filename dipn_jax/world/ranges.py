@@ -47,7 +47,7 @@ class Ranges:
 
 
 DEFAULT_RANGES = Ranges()
-"""The ranges used unless told otherwise."""
+"""The default ranges."""
 
 
 def _require_in_catalogue(items: tuple[str, ...]) -> None:

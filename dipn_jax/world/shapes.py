@@ -1,6 +1,6 @@
 """The catalogue of objects, each made of one or more convex prisms.
 
-A class is defined once, in a unit cube, as up to `PARTS` convex polygons extruded along one axis; an
+A class is defined once, in a unit cube, as up to `CONVEX_PARTS` convex polygons extruded along one axis; an
 object is its class stretched to its bounding box. An object's frame is at its centre of mass, along the
 axes of the box. Everything downstream (MuJoCo model,
 collision hulls, renderer) reads the same vertices, so sizes and even classes can be traced values.
@@ -26,7 +26,7 @@ CLASSES = ("cuboid", "cylinder", "half_cylinder", "triangular_prism", "concave")
 """Classes of shapes; `Scene.shape` is an index into them."""
 CORNERS = 12
 """Largest number of corners of a part's cross-section."""
-PARTS = 3
+CONVEX_PARTS = 3
 """Largest number of convex parts of an object."""
 
 Polygon = list[tuple[float, float]]
@@ -71,8 +71,8 @@ _SECTIONS: dict[str, tuple[int, list[Polygon]]] = {
 
 def _rings() -> tuple[np.ndarray, np.ndarray]:
     """Return the unit vertices [C, P, 2K, 3] and the number of distinct corners [C, P] (0: no such part)."""
-    vertices = np.zeros((len(CLASSES), PARTS, 2 * CORNERS, 3))
-    used = np.zeros((len(CLASSES), PARTS), np.int32)
+    vertices = np.zeros((len(CLASSES), CONVEX_PARTS, 2 * CORNERS, 3))
+    used = np.zeros((len(CLASSES), CONVEX_PARTS), np.int32)
     for c, name in enumerate(CLASSES):
         axis, polygons = _SECTIONS[name]
         for p, polygon in enumerate(polygons):
@@ -125,7 +125,7 @@ AXIS = np.array([_SECTIONS[name][0] for name in CLASSES], np.int32)
 
 def _sides() -> np.ndarray:
     """Return for each ring edge [C, P, K] the first ring edge in the same plane: itself, or 0 for a repeated corner."""
-    side = np.tile(np.arange(CORNERS), (len(CLASSES), PARTS, 1))
+    side = np.tile(np.arange(CORNERS), (len(CLASSES), CONVEX_PARTS, 1))
     repeated = (side >= CORNERS_USED[..., None] - 1) & (side < CORNERS - 1)
     return np.where(repeated, 0, side)
 
@@ -207,7 +207,7 @@ def hull(shape: Int[Array, ""] | int, size: Float[Array, " 3"]) -> Hull:
     sides = jnp.asarray(SIDES)[index]
     normal = jnp.take_along_axis(normal, sides[..., None], axis=1)
     corner = jnp.take_along_axis(ring, sides[..., None], axis=1)
-    caps = jnp.broadcast_to(jnp.stack([-axis, axis]), (PARTS, 2, 3))
+    caps = jnp.broadcast_to(jnp.stack([-axis, axis]), (CONVEX_PARTS, 2, 3))
     cap_corner = jnp.stack([vertices[:, 0], vertices[:, CORNERS]], axis=1)
     normals = jnp.concatenate([normal, caps], axis=1)
     offsets = (normals * jnp.concatenate([corner, cap_corner], axis=1)).sum(-1)

@@ -70,7 +70,8 @@ def clear(
       released: add the clauses of DIPN's released code: a lone object is grasped; a push must raise the best score,
         too; gamma applies only to pushes after which that is over 0.5; and no object may leave the workspace if it
         moves twice as far as predicted.
-      aids: what no paper has; docs/concepts.md says what each does. --aids with nothing behind it: none of them.
+      aids: small rules of ours that are in no paper; docs/concepts.md says what each does. --aids with nothing behind
+        it: none of them.
       label: for the report, what distinguishes this evaluation from others of its method, such as the data learnt from.
       seed: random seed of scenes, perturbations, noise and candidates.
       engine: physics engine.

@@ -22,7 +22,7 @@ JITTER = 0.002
 MASS_FACTOR = (0.8, 1.2)
 """Range of the factor on the mass of each object of a repeated case."""
 FRICTION_FACTOR = (0.85, 1.15)
-"""Range of the factor on its friction."""
+"""Range of the factor on the friction of each object of a repeated case."""
 
 
 @plain.register
@@ -33,11 +33,11 @@ class Instance:
     name: str
     scene: Scene  # numpy, [N]
     poses: np.ndarray  # [N, 7]
-    objects: int
+    objects: int  # on the table at the beginning
     number: int = 0  # of its random keys; it does not depend on the other tables
-    grasps: int = 0
-    pushes: int = 0
-    removed: int = 0
+    grasps: int = 0  # made so far, held or missed
+    pushes: int = 0  # made so far
+    removed: int = 0  # objects taken away by grasps so far
     held: int = 0  # grasps that held something
     ended: str = ""  # cleared, pushed out, out of actions, fault
     did: list[str] = dataclasses.field(default_factory=list)  # push, grasp held or grasp missed, one an action

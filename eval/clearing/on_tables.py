@@ -12,7 +12,8 @@ from dipn_jax import batching
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.planning import methods
-from dipn_jax.planning.methods import Act, Networks, Policy
+from dipn_jax.planning.acts import DecideFunction
+from dipn_jax.planning.methods import Networks, Policy
 from dipn_jax.planning.planner import Rule
 from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.structs import Array, Decision, Observation, Scene
@@ -59,27 +60,28 @@ def in_lockstep(policy: Policy, *, camera: Camera = DEFAULT_CAMERA) -> TablePoli
 
     def decide(keys: jax.Array, scene: Scene, poses: Array, recall: Recall) -> tuple[Decision, Observation]:
         seen = camera.look(keys, scene, poses)
-        each = functools.partial(_decide_each, act=policy.act, rule=policy.rule, distances=policy.distances)
+        function, rule, distances = policy.decide_function, policy.rule, policy.distances
+        each = functools.partial(_decide_each, decide_function=function, rule=rule, distances=distances)
         return batching.in_small_batches(each, keys, seen, recall(seen.height)), seen
 
     return decide
 
 
-@functools.partial(jax.jit, static_argnames="act")
+@functools.partial(jax.jit, static_argnames="decide_function")
 def _decide_each(
     keys: jax.Array,
     seen: Observation,
     missed: jax.Array,
     real: jax.Array,
     *,
-    act: Act,
+    decide_function: DecideFunction,
     rule: Rule,
     distances: jax.Array,
 ) -> Decision:
     """Decide on the tables that are real, one after another: a decision is itself a batch of images."""
 
     def one(key: jax.Array, observation: Observation, misses: jax.Array) -> Decision:
-        return act(key, observation, misses, rule, distances).brief()
+        return decide_function(key, observation, misses, rule, distances).brief()
 
     def some(args: tuple[jax.Array, Observation, jax.Array, jax.Array]) -> Decision:
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(one, *args[:3]))

@@ -68,7 +68,7 @@ def sweep(
       pushes: scenes of 1 to 7 objects, a push in each, for the prediction error; 0: do not measure it.
       gamma: discount of a push's value.
       threshold: grasp at once above this score.
-      aids: what no paper has, as of dipn-eval clear.
+      aids: small rules of ours that are in no paper, as of dipn-eval clear.
       seed: random seed of scenes, perturbations and candidates.
       engine: physics engine.
       threads: threads of the native engine; one per core by default.

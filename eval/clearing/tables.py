@@ -92,4 +92,4 @@ class Tables:
 
 
 DEFAULT_TABLES = Tables()
-"""The tables that are cleared unless told otherwise."""
+"""The tables that are cleared by default."""

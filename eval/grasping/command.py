@@ -53,7 +53,7 @@ def grasp(
       seed: random seed of scenes and random grasps; the scenes are never those of training data.
       others: where a grasp missed, also try this many of the next best ones, to see what physics allows; they are
         ranked as the policy ranked them, from the same image and with the same memory of misses.
-      aids: what no paper has, as of dipn-eval clear; still is not about grasps.
+      aids: small rules of ours that are in no paper, as of dipn-eval clear; still is not about grasps.
       camera: what GN sees; masks do not matter to it.
       engine: physics engine.
       threads: threads of the native engine; one per core by default.

@@ -35,7 +35,7 @@ FORMS = {
     "single_label": Form("b", ("S",)),  # what pre-training says of it
     "single_held": Form("b", ("S",)),
 }
-"""Arrays of what was tried; the first of each kind numbers its table or scene, by which they are in order."""
+"""Arrays of what was tried; the first of each kind has the table or scene of each grasp, in order of which they are."""
 BINS = 10
 """Number of bins of scores."""
 
@@ -68,7 +68,7 @@ def _rate(name: str, hits: Any, trials: Any) -> dict[str, float]:
 
 
 def _random_rates(found: Arrays) -> dict[str, Any]:
-    """Return how the grasps of random pixels went that can be used."""
+    """Return success rates of the usable grasps at random pixels."""
     good = found["random_usable"]
     success = found["random_success"].astype(float)[good]
     said = calibration(found["random_score"][good], success)
@@ -86,7 +86,7 @@ def _other_rates(found: Arrays, count: int) -> dict[str, float]:
 
 
 def label_rates(found: Arrays) -> dict[str, float]:
-    """Return how often labels agree with physics, of the grasps that can be used."""
+    """Return how often labels agree with physics, over the usable grasps."""
     said, held = (found[name][found["single_usable"]] for name in ("single_label", "single_held"))
     agreed = {"agree": said == held, "positive_holds": held[said], "negative_fails": ~held[~said], "positive": said}
     return {"grasps": len(said)} | {name: float(np.mean(rate)) for name, rate in agreed.items()}

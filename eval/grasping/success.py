@@ -170,7 +170,7 @@ def _next_best(seen: Observation, missed: jax.Array, tried: jax.Array, *, scorer
 def labels_tried(
     engine: Engine, config: SceneConfig, *, scenes: int, seed: int, each: int = 4, share: Share = WHOLE
 ) -> Arrays:
-    """Hold the labels of pre-training against physics, for random grasps of the foreground.
+    """Compare the labels of pre-training with physics, for random grasps of the foreground.
 
     Args:
       engine: physics engine.

@@ -1,4 +1,4 @@
-"""The networks that were measured: which step of which run, and what its weights are known by."""
+"""The networks that were measured: which step of which run, and the digest of its weights."""
 
 from __future__ import annotations
 

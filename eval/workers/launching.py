@@ -19,7 +19,7 @@ from .shares import PART, Share
 if TYPE_CHECKING:
     from dipn_jax.storage import resume
 
-PARTS = "parts"
+PARTS_FOLDER = "parts"
 """Name of the folder with the parts, in that of the evaluation."""
 
 
@@ -49,7 +49,7 @@ def evaluate(kind: str, asked: Mapping[str, Any], partial: resume.Partial) -> No
         ):
             for _ in finished:
                 progress.advance(1)
-        for left in (out / PARTS).glob(".*.tmp"):  # of tasks that were lost
+        for left in (out / PARTS_FOLDER).glob(".*.tmp"):  # of tasks that were lost
             shutil.rmtree(left, ignore_errors=True)
         parts = [shares.read(place(out, share)) for share in every]
         merging.check(parts)
@@ -59,17 +59,18 @@ def evaluate(kind: str, asked: Mapping[str, Any], partial: resume.Partial) -> No
 
 def place(out: pathlib.Path, share: Share) -> pathlib.Path:
     """Return the folder of a part of the evaluation in the folder `out`."""
-    return out / PARTS / f"{share.shard:05d}-of-{share.of:05d}"
+    return out / PARTS_FOLDER / f"{share.shard:05d}-of-{share.of:05d}"
 
 
 def make_part(kind: str, given: dict[str, Any]) -> None:
-    """Make a part by the command that makes it alone; a task, which may have been tried before, or run twice.
+    """Make a part by the command that makes it alone. Runs as a Ray task, so it may be retried, or run twice.
 
     It works in a folder of its own, which gets the part's name at the end, unless another did that meanwhile.
 
     Args:
       kind: command of dipn-eval.
-      given: its options by name, as its function takes them; a dictionary, because each command has its own.
+      given: its options by name, as its function takes them; a dictionary, because each command has its own
+        options.
     """
     from .. import cli
 

@@ -79,7 +79,7 @@ def _merger(kind: str) -> Callable[[Sequence[Part], pathlib.Path], dict[str, Any
 
 
 def check(parts: Sequence[Part]) -> None:
-    """Return if the parts are all of one evaluation, each once.
+    """Raise an error unless the parts are all of one evaluation, each once.
 
     Raises:
       UserError: they are not; it says which differ in what, which is there twice, or which is missing.
@@ -95,14 +95,15 @@ def check(parts: Sequence[Part]) -> None:
             raise UserError(f"{one} and {part.folder}: both are shard {part.shard} of {part.of}; give each part once")
         found[part.shard] = part
     if missing := sorted(set(range(first.of)) - set(found)):
-        named = ", ".join(map(str, missing[: accounting.MOST_NAMED]))
-        more = f" and {len(missing) - accounting.MOST_NAMED} more" if len(missing) > accounting.MOST_NAMED else ""
+        unnamed = len(missing) - accounting.MAX_SHARDS_NAMED
+        named = ", ".join(map(str, missing[: accounting.MAX_SHARDS_NAMED]))
+        more = f" and {unnamed} more" if unnamed > 0 else ""
         which = f"shard{'s' if len(missing) > 1 else ''} {named}{more} of {first.of}"
         raise UserError(f"{which} missing: run {_run(first, missing[0])}")
 
 
 def _difference(one: Part, other: Part) -> str:
-    """Return in what two parts differ, so that they are of different evaluations; an empty text if in nothing."""
+    """Return the difference that makes two parts of different evaluations; an empty text if there is none."""
     if one.kind != other.kind:
         return f"parts of dipn-eval {one.kind} and of dipn-eval {other.kind}"
     for key in sorted({*one.named, *other.named}):

@@ -50,7 +50,7 @@ class Share:
         return self.shard is None
 
     def check(self, launch: Launch) -> None:
-        """Raise a UserError for a share that makes no sense where the evaluation is launched so."""
+        """Raise a UserError for a share that does not fit the way in which the evaluation is launched."""
         if not launch.spreads and self.shard is None and self.of > 1:
             raise UserError(f"--of {self.of}: give --shard, too: this worker's number, 0 to {self.of - 1}")
         if launch.spreads and (self.shard is not None or self.of < 2):
@@ -112,7 +112,7 @@ class Part:
         return path
 
     def again(self) -> str:
-        """Say what to do about a part that cannot be used."""
+        """Return in words what to do about a part that cannot be used."""
         return f"delete {self.folder / PART} and run its command again"
 
 

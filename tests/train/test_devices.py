@@ -191,8 +191,8 @@ def test_processes_that_do_not_come_or_cannot_join_and_a_port_in_use_are_one_lin
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     come = threading.Event()
-    monkeypatch.setattr(devices, "SILENCE", 0.01)
-    monkeypatch.setattr(devices, "PATIENCE", 0.05)
+    monkeypatch.setattr(devices, "WAIT_NOTICE_SECONDS", 0.01)
+    monkeypatch.setattr(devices, "WAIT_LIMIT_SECONDS", 0.05)
     monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: come.wait())
     second = Compute(data_parallel=True, coordinator="localhost:9", processes=2, process=1)
     with pytest.raises(UserError, match="--coordinator localhost:9: not all processes came within 0 s"):
@@ -203,7 +203,7 @@ def test_processes_that_do_not_come_or_cannot_join_and_a_port_in_use_are_one_lin
     def refuse(*_: object, **__: object) -> None:
         raise ValueError("no\nsuch job")
 
-    monkeypatch.setattr(devices, "PATIENCE", 60)
+    monkeypatch.setattr(devices, "WAIT_LIMIT_SECONDS", 60)
     monkeypatch.setattr(jax.distributed, "initialize", refuse)
     with pytest.raises(UserError, match=r"--coordinator localhost:9: cannot join \(no\?such job\)"):
         devices.join(second)
@@ -322,11 +322,11 @@ def test_half_precision_learns_what_single_precision_does(
 
 def test_some_steps_are_profiled(tmp_path: pathlib.Path) -> None:
     with profiling.Profiler(tmp_path, 7) as profiler:
-        for step in range(7, 7 + profiling.LAST):
+        for step in range(7, 7 + profiling.LAST_STEP):
             profiler.see(step)
             assert not list(tmp_path.rglob("*.xplane.pb"))
-        profiler.see(7 + profiling.LAST)
+        profiler.see(7 + profiling.LAST_STEP)
         assert list(tmp_path.rglob("*.xplane.pb"))
     with profiling.Profiler(tmp_path / "cut", 0) as profiler:
-        profiler.see(profiling.FIRST)
+        profiler.see(profiling.FIRST_STEP)
     assert list((tmp_path / "cut").rglob("*.xplane.pb")), "a run that ends early"

@@ -20,7 +20,7 @@ from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
-from dipn_jax.storage.space import SPARE, Space
+from dipn_jax.storage.space import FREE_DISK_BYTES, Space
 from dipn_jax.system import machine
 
 
@@ -61,7 +61,7 @@ def test_each_example_is_made_once_and_the_right_one_is_returned(tmp_path: pathl
 def test_a_disk_that_is_nearly_full_is_one_line(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store, _ = _store(tmp_path / "s")
     _check(store, [1])
-    full = shutil.disk_usage(tmp_path)._replace(free=int(SPARE))
+    full = shutil.disk_usage(tmp_path)._replace(free=int(FREE_DISK_BYTES))
     monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
     with pytest.raises(UserError, match=r"100\.0 MB are free, and more examples need 0\.0 MB and some to spare; make"):
         store.take(np.array([2]))

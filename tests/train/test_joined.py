@@ -82,7 +82,7 @@ def _in_a_file(array: Any) -> bool:
 def test_what_memory_has_no_room_for_is_the_same_in_files(
     several: bool, data: Data, wider: Data, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(split, "_SOME", 7)  # copied in parts
+    monkeypatch.setattr(split, "_COPIED_AT_A_TIME", 7)  # copied in parts
     folders = (data["push"], wider["push"]) if several else data["push"]
     half = lambda episodes, folder: np.arange(0, len(episodes.fault), 2) if folder == data["push"] else None  # noqa: E731
     for choose in (lambda *_: None, half):

@@ -94,7 +94,7 @@ def test_a_step_that_cannot_be_saved_ends_the_run_with_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The step in the middle is noticed when the next is saved, the last one at the end; then the run goes on."""
+    """The step in the middle is noticed when the next is saved, the last one at the end; then the run continues."""
     task, write = _task("push", data), checkpoint._write
 
     def full(folder: pathlib.Path, *rest: Any) -> None:

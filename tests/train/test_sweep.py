@@ -79,9 +79,9 @@ def test_each_seed_and_limit_is_trained_once_and_more_can_be_added(
     quick: None, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert _sweep(tmp_path, "--seeds", "0", "3", "--limits", "8", "13", "--at-once", "2") == 0
-    assert _starts(tmp_path) == {"8-0": 1, "13-0": 2, "8-3": 1, "13-3": 2}, "those that are killed go on"
+    assert _starts(tmp_path) == {"8-0": 1, "13-0": 2, "8-3": 1, "13-3": 2}, "those that are killed continue"
     said = capfd.readouterr()
-    assert "13-3: its process was killed (-9); goes on" in said.err and "13-3: train: 2" in said.err
+    assert "13-3: its process was killed (-9); continues" in said.err and "13-3: train: 2" in said.err
     assert "/4] 13-0: step 6, loss 1.625\n" in said.out
     table = ["training  step   loss", "     8-0     6      1", "    13-0     6  1.625"]
     assert said.out.splitlines()[-5:-2] == table
@@ -111,7 +111,7 @@ def test_each_limit_may_have_its_own_steps(quick: None, tmp_path: pathlib.Path) 
     assert kept["command"] == ["push", "--data", str(pathlib.Path("data").absolute())]
     assert [kept["trainings"][name]["steps"] for name in ("8-0", "16-0")] == [3, 5]
     assert _sweep(tmp_path, "--limits", "16", "8", "--steps", "5", "4") == 0
-    assert _starts(tmp_path) == {"8-0": 2, "16-0": 1}, "one that is to make more steps goes on"
+    assert _starts(tmp_path) == {"8-0": 2, "16-0": 1}, "one that is to make more steps continues"
 
 
 def test_a_mistake_ends_the_job_before_anything_is_written(

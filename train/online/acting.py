@@ -26,7 +26,7 @@ EXPLORED_AT_FIRST = 0.5
 EXPLORED_AT_LEAST = 0.1
 """Share of actions whose primitive stays random. Source: VPG's released code."""
 EXPLORATION_DECAY = 0.9998
-"""Factor of that share, for every action. Source: VPG's released code."""
+"""Factor of the share of random primitives, for every action. Source: VPG's released code."""
 OBJECT_HEIGHT = 0.01
 """Metres above which a pixel shows an object."""
 CHANGED_TABLE_PIXELS = 300

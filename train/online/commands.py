@@ -13,9 +13,9 @@ from dipn_jax.world.ranges import DEFAULT_RANGES, Objects, Ranges
 from ..configs import LARGEST_BATCH, BaselineConfig, OnlineConfig, check_out
 
 GRASP_ONLINE = OnlineConfig()
-"""How `grasp-online` learns unless told otherwise."""
+"""Defaults of `dipn-train grasp-online`."""
 BASELINE = BaselineConfig()
-"""How `baseline` learns unless told otherwise."""
+"""Defaults of `dipn-train baseline`."""
 
 
 def say(out: pathlib.Path, result: dict[str, float], *, digits: str) -> None:

@@ -122,7 +122,7 @@ class _Outcomes:
     """The part of a task that `make_step` needs."""
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
-        """Cross entropy of executed grasps."""
+        """Return the cross entropy of executed grasps."""
         return executed_loss(key, model, batch)
 
 

@@ -66,10 +66,10 @@ def test_output_takes_any_name_whatever_its_encoding() -> None:
 
 def test_a_terminal_without_room_gets_help_that_is_wide_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "1")
-    surroundings.settle()
+    surroundings.set_environment()
     assert int(os.environ["COLUMNS"]) == surroundings.NARROWEST
     monkeypatch.setenv("COLUMNS", "100")
-    surroundings.settle()
+    surroundings.set_environment()
     assert os.environ["COLUMNS"] == "100"
 
 

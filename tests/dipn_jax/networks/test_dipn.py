@@ -192,7 +192,7 @@ def test_the_prediction_at_a_distance_does_not_depend_on_the_other_distances(for
     assert np.abs(forward(inputs, np.zeros_like(DISTANCES))).max() == 0, "a push of no length moves nothing"
     ends = forward(inputs, np.tile(np.array([0.09, 0.10, 0.12], np.float32), (6, 1)))
     beyond = ends[:, :, 1] + 2 * (ends[:, :, 1] - ends[:, :, 0])
-    np.testing.assert_allclose(ends[:, :, 2], beyond, atol=1e-3)  # past 10 cm objects go on as in the last centimetre
+    np.testing.assert_allclose(ends[:, :, 2], beyond, atol=1e-3)  # past 10 cm as in the last centimetre
     halfway = forward(inputs, np.tile(np.array([0.04, 0.05, 0.045], np.float32), (6, 1)))
     np.testing.assert_allclose(halfway[:, :, 2], halfway[:, :, :2].mean(2), atol=1e-4)
 

@@ -174,7 +174,7 @@ def test_a_fall_too_fast_a_stopped_hand_and_an_object_inside_another_are_faults(
     low[1, 2] = 0.01
     down = Trajectory(np.tile(np.float32([0, 0.3]), (BATCH, 1)), np.stack([high, low], 1))
     found = engine.simulate(cubes, bad, down, np.array([0.55]))
-    faults = (Fault.SPEED, Fault.SHORT)
+    faults = (Fault.SPEED, Fault.GRIPPER_SHORT)
     np.testing.assert_array_equal([[bool(f & each) for each in faults] for f in found.fault], np.eye(4, 2, dtype=bool))
     depth = [bool(f & Fault.PENETRATION) for f in primitives.settle(engine, cubes, inside, duration=0.01).fault]
     assert depth == [False, False, False, True]

@@ -214,8 +214,8 @@ def test_a_gripper_that_is_stopped_is_a_fault(engine: Any, resting: Any) -> None
     scene, poses = resting
     heavy = scene.replace(mass=np.full_like(scene.mass, 60.0))
     stopped, free = (primitives.push(engine, each, poses, _pushes(5)) for each in (heavy, scene))
-    assert (stopped.fault & Fault.SHORT).any(), "it is lifted in the end, where it should be"
-    assert not (free.fault & Fault.SHORT).any()
+    assert (stopped.fault & Fault.GRIPPER_SHORT).any(), "it is lifted in the end, where it should be"
+    assert not (free.fault & Fault.GRIPPER_SHORT).any()
 
 
 def test_an_object_that_is_pushed_over_is_flagged(engine: Any) -> None:

@@ -101,7 +101,7 @@ def test_it_is_the_loop_on_the_host(both: tuple[tuple[Rollout, Any, Any], tuple[
 
 def test_the_tables_show_what_there_is_to_show(both: Any) -> None:
     rollout, watch, _ = both[1]
-    assert rollout.fault[1] & Fault.NON_FINITE and rollout.fault[3] & Fault.SHORT
+    assert rollout.fault[1] & Fault.NON_FINITE and rollout.fault[3] & Fault.GRIPPER_SHORT
     inward = (rollout.poses[2, -1, 1] - rollout.poses[2, 0, 1])[:2] * np.array([-1, 1])
     assert (inward > 0.02).all() and watch.deepest.max() > 1e-3 and watch.fastest[2].max() > 1
 

@@ -21,7 +21,7 @@ def made(request: pytest.FixtureRequest) -> Any:
     shape[:, 1] = ABSENT
     size = rng.uniform(0.02, 0.1, (SIZES, 3, 3)).astype(np.float32)
     scenes = Scene(shape, size, np.ones_like(size), *np.full((2, SIZES, 3), 0.5, np.float32))
-    kind, bounds = warp_model.kinds(scenes), np.repeat(size, shapes.PARTS, 1)
+    kind, bounds = warp_model.kinds(scenes), np.repeat(size, shapes.CONVEX_PARTS, 1)
     spec = mujoco.MjSpec()
     for b, m in np.argwhere(kind >= 0):
         rings = shapes.UNIT_VERTICES[warp_model.KINDS[kind[b, m]]] * bounds[b, m].astype(float)
@@ -106,5 +106,5 @@ def test_an_empty_slot_has_no_mesh(made: Any) -> None:
     kind, _, rows, _ = made
     mesh = rows["geom_dataid"][:SIZES, -kind.shape[1] :]
     np.testing.assert_array_equal(mesh >= 0, kind >= 0)
-    assert (mesh[:, shapes.PARTS : 2 * shapes.PARTS] == -1).all()
+    assert (mesh[:, shapes.CONVEX_PARTS : 2 * shapes.CONVEX_PARTS] == -1).all()
     assert len(np.unique(mesh[mesh >= 0])) == (kind >= 0).sum()

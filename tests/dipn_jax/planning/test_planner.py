@@ -146,7 +146,7 @@ def test_a_grasp_is_chosen_by_one_value_and_compared_by_another(seen: Observatio
 
     def decide(push: float, **options: Any) -> Any:
         return planner.decide_by_value(
-            seen, valued(push), valued(0.1, 0.2), plain=valued(0.5, 0.1), distance=0.1, **options
+            seen, valued(push), valued(0.1, 0.2), network_scores=valued(0.5, 0.1), distance=0.1, **options
         )
 
     decision = decide(0.55)

@@ -19,7 +19,7 @@ def seen(settled: Any) -> Observation:
 
 def _ious(found: np.ndarray, true: np.ndarray) -> list[float]:
     matched = segment.match(found, true, slots=SLOTS)
-    pairs = [(found == matched[i], true == i) for i in range(SLOTS) if (true == i).sum() >= segment.SMALLEST]
+    pairs = [(found == matched[i], true == i) for i in range(SLOTS) if (true == i).sum() >= segment.MIN_REGION_PIXELS]
     return [(a & b).sum() / (a | b).sum() for a, b in pairs]
 
 

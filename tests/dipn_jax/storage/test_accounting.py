@@ -52,7 +52,7 @@ def test_a_worker_that_never_ran_is_named_with_its_command(
     upkeep.info(copy)
     shown = capsys.readouterr()
     assert json.loads(shown.out)["missing"] == said and shown.err == f"warning: {said}\n"
-    assert len(records.load(copy, kind="push")[0].fault) == 16, "training goes on"
+    assert len(records.load(copy, kind="push")[0].fault) == 16, "training continues"
     assert capsys.readouterr().err == f"warning: {said}\n"
 
 

@@ -89,7 +89,7 @@ def test_a_shard_that_is_named_by_the_manifest_is_in_the_copy(
 
 def test_an_interrupted_copy_goes_on(there: pathlib.Path, fetched: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     url, write = f"file://{there}", files.write_atomically
-    monkeypatch.setattr(mirror, "NOTED", 1)
+    monkeypatch.setattr(mirror, "OBJECTS_PER_INDEX_WRITE", 1)
 
     def interrupted(path: pathlib.Path, data: bytes) -> None:
         if path.name == "shard-00001.parquet":

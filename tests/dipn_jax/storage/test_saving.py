@@ -25,7 +25,7 @@ PATIENCE = 60.0
 
 
 class Slow:
-    """Stands in for `checkpoint.save`: writes nothing, and goes on only when the test allows it."""
+    """Stands in for `checkpoint.save`: writes nothing, and continues only when the test allows it."""
 
     def __init__(self) -> None:
         self.begun, self.allowed = threading.Semaphore(0), threading.Semaphore(0)

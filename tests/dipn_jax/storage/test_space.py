@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dipn_jax.errors import UserError
-from dipn_jax.storage.space import SPARE, Filled, Space
+from dipn_jax.storage.space import FREE_DISK_BYTES, Filled, Space
 
 LIKE = {"square": np.zeros((2, 3)), "half": np.zeros(2, np.float16)}
 SIZE = 5 * (3 * 8 + 2)
@@ -41,11 +41,11 @@ def test_memory_is_granted_once_and_again_when_it_is_free(
 
 
 def test_a_disk_without_room_is_one_line(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    full = shutil.disk_usage(tmp_path)._replace(free=int(SPARE) + SIZE - 1)
+    full = shutil.disk_usage(tmp_path)._replace(free=int(FREE_DISK_BYTES) + SIZE - 1)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
     with pytest.raises(UserError, match=r"100\.0 MB are free, and rows need 0\.0 MB and some to spare; make room"):
         Space(0, tmp_path).arrays(5, LIKE, what="rows")
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: full._replace(free=int(SPARE) + SIZE))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full._replace(free=int(FREE_DISK_BYTES) + SIZE))
     made, make = [], tempfile.TemporaryFile
     monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: made.append(dir) or make(dir=dir))  # type: ignore[func-returns-value]
     assert in_files(Space(0, tmp_path).arrays(5, LIKE, what="rows")) == [True, True]

@@ -45,7 +45,7 @@ def test_options_of_data_sets_take_urls_and_others_refuse_them(
 
 
 def test_lines_name_a_copy_by_its_url(capsys: pytest.CaptureFixture[str], tmp_path: pathlib.Path) -> None:
-    addresses.call(tmp_path, "s3://bucket/data")
+    addresses.show_instead(tmp_path, "s3://bucket/data")
     console.say(f"{tmp_path / 'x'}: whole")
     console.warn(f"run `dipn-datagen repair {tmp_path}`")
     output = capsys.readouterr()
@@ -55,7 +55,7 @@ def test_lines_name_a_copy_by_its_url(capsys: pytest.CaptureFixture[str], tmp_pa
 
 def test_a_task_says_the_url_of_its_copy(tmp_path: pathlib.Path) -> None:
     """It has names of its own, which the command that gets its line does not know."""
-    addresses.call(tmp_path, "s3://bucket/data")
+    addresses.show_instead(tmp_path, "s3://bucket/data")
 
     def failing(error: Exception) -> None:
         raise error

@@ -24,7 +24,7 @@ def _handlers() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", ALL)
-def test_a_signal_lets_the_step_at_hand_end_and_a_command_ends_as_interrupted(number: signal.Signals) -> None:
+def test_a_signal_lets_the_current_step_end_and_interrupts_the_command(number: signal.Signals) -> None:
     done = []
 
     def work() -> None:
@@ -53,7 +53,7 @@ def test_a_hang_up_that_nohup_ignores_stays_ignored() -> None:
 
 @pytest.mark.parametrize("number", ALL)
 def test_a_signal_within_a_callback_is_not_lost(number: signal.Signals, capfd: pytest.CaptureFixture[str]) -> None:
-    """Python prints what a callback raises, and goes on."""
+    """Python prints what a callback raises, and continues."""
 
     def callback(phase: str, _: object) -> None:
         if phase == "start" and callback in gc.callbacks:

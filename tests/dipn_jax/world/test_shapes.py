@@ -11,7 +11,7 @@ SIZE = np.array([0.1, 0.05, 0.04])
 def _reference(index: int) -> mujoco.MjModel:
     """Return the shape as MuJoCo computes it from meshes of density 1000."""
     meshes, geoms = "", ""
-    for part in range(shapes.PARTS):
+    for part in range(shapes.CONVEX_PARTS):
         n = shapes.CORNERS_USED[index, part]
         if n:
             v = shapes.UNIT_VERTICES[index, part] * SIZE

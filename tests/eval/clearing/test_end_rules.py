@@ -104,7 +104,7 @@ def _play(
     (ended,) = lockstep.clear([table], None, script.decide, partial, seed=0, **options)  # type: ignore[arg-type]
     partial.finish()
     assert script.done == ended.actions == len(ended.film)
-    assert script.longest in (0.0, 0.1), "the longest push of a data set, unless told otherwise"
+    assert script.longest in (0.0, 0.1), "the longest push of a data set by default"
     assert shown.done == ended.removed and shown.notes[-1] == "1/1 tables ended" and len(shown.notes) == ended.actions
     assert all(note == "0/1 tables ended" for note in shown.notes[:-1])
     return ended

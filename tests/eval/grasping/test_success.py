@@ -51,7 +51,7 @@ class Lifts:
         out = np.repeat(np.asarray(poses)[:, None], len(samples), 1)
         away = np.linalg.norm(out[:, 0, :, :2] - np.asarray(paths.target)[:, 2, None, :2], axis=-1)
         out[:, -1, :, 2] += np.where((away < self.reach) & (np.asarray(scene.mass) < HEAVY), GRIPPER.lift, 0)
-        fault = np.where((np.asarray(scene.friction) == FAULTY).any(-1), Fault.NON_FINITE, Fault.SHORT)
+        fault = np.where((np.asarray(scene.friction) == FAULTY).any(-1), Fault.NON_FINITE, Fault.GRIPPER_SHORT)
         return Rollout(out, np.zeros((*out.shape[:2], 5), np.float32), fault.astype(np.int32))
 
 
