@@ -26,9 +26,11 @@ class Conv(nnx.Conv):
         self, x: Float[jax.Array, "B H W C"]
     ) -> Float[jax.Array, "B h w {self.out_features}"]:
         """Convolve maps, to a resolution lower by the stride; computed in the layer's `dtype`, as any layer of Flax."""
-        bias = None if self.bias is None else self.bias[...]
-        x, kernel, bias = self.promote_dtype((x, self.kernel[...], bias), dtype=self.dtype)
-        bias = 0.0 if bias is None else bias
+        bias: jax.Array | float = 0.0
+        if self.bias is None:
+            x, kernel = self.promote_dtype((x, self.kernel[...]), dtype=self.dtype)
+        else:
+            x, kernel, bias = self.promote_dtype((x, self.kernel[...], self.bias[...]), dtype=self.dtype)
         size, step = kernel.shape[0], self.strides[0]  # type: ignore[index]
         if kernel.shape[:2] == (1, 1):
             return x[:, ::step, ::step] @ kernel[0, 0] + bias
