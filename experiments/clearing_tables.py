@@ -149,7 +149,7 @@ def _table(values: dict[str, Any], head: str, rows: dict[str, str]) -> str:
             cells = [str(values[f"{at}/tables"]), str(values[f"{at}/pushes"])]
             cells += [_cell(values, f"{at}/{key}") for key in TITLES]
             lines.append([title, *cells, _difference(values, f"{at}/efficiency_all")])
-    return markdown.table([head, "tables", "pushes", *TITLES.values(), "efficiency, difference"], lines)
+    return markdown.table([head, "tables", "pushes", *TITLES.values(), "objects per action, difference"], lines)
 
 
 PUSH_OR_NOT = ("gn", "dipn+gn+actions")

@@ -161,8 +161,12 @@ PROMISES = (
     ),
     Promise(
         "A training shared by devices or processes learns what one device learns, up to rounding; interrupting one "
-        "process ends all of them with a checkpoint, from which any number of devices can continue.",
-        ("tests/train/test_devices.py::test_four_devices_learn_what_one_does_and_one_goes_on_from_there",),
+        "process ends all of them with a checkpoint, from which any number of devices can continue. If one is killed, "
+        "the others end, and the last checkpoint is whole.",
+        (
+            "tests/train/test_devices.py::test_four_devices_learn_what_one_does_and_one_goes_on_from_there",
+            "tests/train/test_devices.py::test_a_process_that_is_killed_ends_the_others_and_nothing_saved_is_lost",
+        ),
     ),
     Promise(
         "Data sets are merged completely or not at all, and an interrupted export continues to the same bytes.",
