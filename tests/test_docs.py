@@ -136,6 +136,14 @@ def test_the_readme_fits_on_a_screen_and_its_table_is_the_kept_one() -> None:
     assert f"for DIPN + GN on the hard tables {said}" in " ".join(text.split())
 
 
+def test_the_changelog_is_short() -> None:
+    versions = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1:]
+    for version in versions:
+        bullets = version.split("\n- ")[1:]
+        assert len(bullets) <= 20
+        assert all(bullet.split("\n\n")[0].count("\n") < 4 for bullet in bullets), version
+
+
 def test_the_licence_and_the_citation_are_there() -> None:
     assert "Apache License" in (ROOT / "LICENSE").read_text()[:200]
     assert "license: Apache-2.0" in (ROOT / "CITATION.cff").read_text()
