@@ -60,12 +60,18 @@ def test_a_process_joins_others_where_a_job_manager_started_several(monkeypatch:
         ("SLURM_STEP_NUM_TASKS", "8", 1),
         ("OMPI_COMM_WORLD_SIZE", "2", 1),
         ("JOB_COMPLETION_INDEX", "0", 0),  # a Kubernetes job, but no service to ask
+        ("KUBERNETES_SERVICE_HOST", "10.0.0.1", 0),  # a pod of no indexed job
     ):
         with monkeypatch.context() as patch:
             patch.setenv(name, value)
             joined.clear()
             devices.join(Compute(data_parallel=True))
             assert len(joined) == wanted, name
+    joined.clear()
+    monkeypatch.setenv("JOB_COMPLETION_INDEX", "0")
+    monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "10.0.0.1")
+    devices.join(Compute(data_parallel=True))
+    assert len(joined) == 1, "an indexed job of Kubernetes"
 
 
 @pytest.mark.parametrize(
