@@ -25,6 +25,7 @@ from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.storage import checkpoint, records, resume, shards
 from dipn_jax.storage.manifest import MANIFEST, update_manifest
+from dipn_jax.storage.space import Space
 from dipn_jax.system import files
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import cases
@@ -250,7 +251,7 @@ def _continue_training(folder: pathlib.Path) -> None:
 
 def _keep_examples(folder: pathlib.Path) -> None:
     """Take up examples that are kept in files, or make them anew, and close them."""
-    kept = ExampleStore(folder, lambda rows: {"x": np.asarray(rows, np.float32)}, 3, about="numbers")
+    kept = ExampleStore(lambda rows: {"x": np.asarray(rows, np.float32)}, 3, space=Space(0, folder), about="numbers")
     assert kept.take(np.arange(3))["x"].tolist() == [0, 1, 2]
     kept.close()
 

@@ -64,7 +64,7 @@ def _space(out: pathlib.Path, compute: Compute) -> Iterator[Space]:
 
     if compute.compile_only:
         with tempfile.TemporaryDirectory() as folder:
-            yield Space(compute.memory, pathlib.Path(folder) / "examples", examples_in_files=True)
+            yield Space(compute.memory, pathlib.Path(folder) / "examples")
     else:
         yield Space(compute.memory, out / "examples" / str(jax.process_index()))
 

@@ -12,16 +12,15 @@ import numpy as np
 from flax import nnx
 
 from dipn_jax import batching, geometry, structs
-from dipn_jax.commands import console
 from dipn_jax.networks import grasp, losses
 from dipn_jax.sight import fingers, render
 from dipn_jax.storage import plain
-from dipn_jax.storage.space import Filled, Space
+from dipn_jax.storage.space import Space
 from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
-from .example_store import Kept
+from .example_store import ExampleStore
 from .split import Folders, first, load_sides, within
 
 PRETRAIN_VIEW = 192
@@ -222,12 +221,11 @@ class GraspTask:
         self._kept = self._keeper(self.train_set, space)
         self._held_out = self._keeper(self.test_set, Space())
 
-    def _keeper(self, episodes: GraspEpisode, space: Space) -> Kept:
+    def _keeper(self, episodes: GraspEpisode, space: Space) -> ExampleStore:
         def make(index: np.ndarray) -> Window:
             return self.prepare(structs.take(episodes, index))
 
-        count = len(episodes.fault)
-        return Kept(make, lambda: self._prepare_all(episodes, space), count, space=space, about=self.fingerprint)
+        return ExampleStore(make, len(episodes.fault), space=space, about=self.fingerprint)
 
     def prepare(self, episodes: GraspEpisode) -> Window:
         """Return windows `[B]` of episodes `[B]` as NumPy arrays."""
@@ -241,21 +239,11 @@ class GraspTask:
         """Let another process take up the windows that are kept in files."""
         self._kept.close()
 
-    def _take(self, kept: Kept, episodes: GraspEpisode, index: np.ndarray) -> Window:
+    def _take(self, kept: ExampleStore, episodes: GraspEpisode, index: np.ndarray) -> Window:
         if self.network_config.preset == "paper":
             return self.prepare(structs.take(episodes, index))
         taken: Window = kept.take(index)
         return taken
-
-    def _prepare_all(self, episodes: GraspEpisode, space: Space) -> Window:
-        count, some = len(episodes.fault), 8 * batching.BATCH
-        made = Filled(count, space, what="examples")
-        with console.Progress("render windows", count, unit="grasps") as progress:
-            for begin in range(0, count, some):
-                part = self.prepare(structs.take(episodes, slice(begin, begin + some)))
-                made.put(begin, part)
-                progress.advance(len(part.target), "")
-        return made.whole
 
     def loss(self, model: nnx.Module, batch: Window, key: jax.Array) -> jax.Array:
         """See `loop.Task`."""

@@ -12,18 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from dipn_jax import batching, geometry, structs
-from dipn_jax.commands import console
+from dipn_jax import geometry, structs
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, losses, push_frame
 from dipn_jax.networks.push_frame import PushInput, View
 from dipn_jax.sight import render, segment
-from dipn_jax.storage.space import Filled, Space
+from dipn_jax.storage.space import Space
 from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
-from .example_store import Kept
+from .example_store import ExampleStore
 from .split import Folders, first, load_sides, within
 
 
@@ -83,25 +82,28 @@ class PushTask:
         self.centimetres = np.array(centimetres, np.int32)
         self.found = found
         self.slots = sides.slots
-        self._kept = Kept(
-            self._some, lambda: self._prepare_all(self.train_set, space), count, space=space, about=self.fingerprint
-        )
-        self._held_out: Example | None = None
+        self._kept = self._keeper(self.train_set, space)
+        self._held_out = self._keeper(self.test_set, Space())
+
+    def _keeper(self, episodes: PushEpisode, space: Space) -> ExampleStore:
+        def make(index: np.ndarray) -> Example:
+            return _halved(self.prepare(structs.take(episodes, index)))
+
+        return ExampleStore(make, len(episodes.fault), space=space, about=self.fingerprint)
 
     def fetch(self, index: np.ndarray) -> Example:
-        """See `loop.Task`. A `compact` network's examples are small, and kept once they have been rendered."""
-        if self.network_config.preset == "paper":
-            return self.prepare(structs.take(self.train_set, index))
-        taken: Example = self._kept.take(index)
-        return taken
+        """See `loop.Task`. A `compact` network's examples are small (20 KB), and kept once they have been rendered."""
+        return self._take(self._kept, self.train_set, index)
 
     def close(self) -> None:
         """Let another process take up the examples that are kept in files."""
         self._kept.close()
 
-    def _some(self, index: np.ndarray) -> Example:
-        """Return the examples `index [B]` as they are kept: crops in half precision."""
-        return _halved(self.prepare(structs.take(self.train_set, index)))
+    def _take(self, kept: ExampleStore, episodes: PushEpisode, index: np.ndarray) -> Example:
+        if self.network_config.preset == "paper":
+            return self.prepare(structs.take(episodes, index))
+        taken: Example = kept.take(index)
+        return taken
 
     def prepare(self, episodes: PushEpisode) -> Example:
         """Return examples `[B]` of episodes `[B]`; rendered, and moved into the push frame, on the device."""
@@ -113,19 +115,6 @@ class PushTask:
             label, counted = np.stack([one[0] for one in each]), np.stack([one[1] for one in each])
         view = self.network_config.view
         return _examples(label, height, episodes, counted, self.centimetres, slots=self.slots, view=view)
-
-    def _prepare_all(self, episodes: PushEpisode, space: Space) -> Example:
-        """Return examples of a whole set, on the host: about 20 KB a push of seven objects."""
-        count = len(episodes.fault)
-        made = Filled(count, space, what="examples")
-        with console.Progress("render examples", count, unit="pushes") as progress:
-            for begin in range(0, count, batching.BATCH):
-                rows = np.arange(begin, begin + batching.BATCH) % count
-                part: Example = structs.take(self.prepare(structs.take(episodes, rows)), slice(0, count - begin))
-                made.put(begin, _halved(part))
-                progress.advance(len(part.taught), "")
-        whole: Example = made.whole
-        return whole
 
     def loss(self, model: nnx.Module, batch: Example, key: jax.Array) -> jax.Array:
         """See `loop.Task`: SmoothL1 in pixels and degrees.
@@ -158,15 +147,10 @@ class PushTask:
         total: dict[str, list[Any]] = {"held_out_loss": [], "moved_error_mm": []}
         graph, state = nnx.split(model)
         size, count = 32, len(self.test_set.fault)
-        if self._held_out is None and self.network_config.preset != "paper":
-            self._held_out = self._prepare_all(self.test_set, Space())
         for begin in range(0, count, size):
             index = np.arange(begin, begin + size) % count
             weight = np.arange(begin, begin + size) < count
-            if self._held_out is None:
-                examples = self.prepare(structs.take(self.test_set, index))
-            else:
-                examples = structs.take(self._held_out, index)
+            examples = self._take(self._held_out, self.test_set, index)
             loss, error, moved = _measure(graph, state, examples, self.centimetres, jnp.asarray(weight))
             total["held_out_loss"].append((self._share * float(loss), int(weight.sum())))
             total["moved_error_mm"].append((float(error), float(moved)))

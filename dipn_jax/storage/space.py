@@ -23,18 +23,15 @@ FREE_DISK_BYTES = 100e6
 class Space:
     """Memory and a disk for arrays; what is granted is shared by all that is put there."""
 
-    def __init__(
-        self, memory: float = math.inf, folder: pathlib.Path | None = None, *, examples_in_files: bool = False
-    ) -> None:
+    def __init__(self, memory: float = math.inf, folder: pathlib.Path | None = None) -> None:
         """Grant memory.
 
         Args:
           memory: GB that all arrays may take in memory.
           folder: what does not fit is put in files on the disk of this folder, which need not exist; None: everything
             is put in memory.
-          examples_in_files: keep examples in files in the folder, even if they fit, and make each when it is used.
         """
-        self.folder, self.examples_in_files = folder, examples_in_files
+        self.folder = folder
         self._memory = 1e9 * memory
         self._taken = 0
 
