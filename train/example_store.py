@@ -95,12 +95,13 @@ class ExampleStore:
         state.unlink(missing_ok=True)
         size = sum(int(np.prod(shape)) * kind.itemsize for shape, kind in shapes)
         console.say(f"{self._folder}: up to {size / 1e9:.1f} GB of examples are kept there, each made when first used")
-        *self._leaves, self._made = [
+        mapped: list[np.ndarray] = [
             np.lib.format.open_memmap(
                 self._folder / f"{number}.npy", mode="r+" if known else "w+", dtype=kind, shape=shape
             )
             for number, (shape, kind) in enumerate(shapes)
         ]
+        self._leaves, self._made = mapped[:-1], mapped[-1]
         if machine.boot():
             files.write_json(state, self._said | {"in_memory_since": machine.boot()})
 
