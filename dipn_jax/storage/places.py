@@ -10,17 +10,19 @@ import concurrent.futures
 import contextlib
 import pathlib
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from dipn_jax.commands import console
 from dipn_jax.storage import accounting, manifest, mirror, records, shards
 from dipn_jax.storage.manifest import MANIFEST
-from dipn_jax.storage.objects import Bucket
+from dipn_jax.storage.objects import Bucket, Found
 from dipn_jax.system import addresses, files, temporary
 
 SILENT_SHARDS = 20
 """Number of shards below which no progress is shown while they are looked at."""
+FEW = 8
+"""Number of shards up to which each is asked for by its name; for more of them, the whole bucket is listed."""
 Claim = Callable[[pathlib.Path], None]
 """Writes the configuration of a data set to its folder, or raises UserError if another one is there."""
 
@@ -93,9 +95,9 @@ class Folder:
 class Objects:
     """A data set in object storage, and a temporary folder."""
 
-    def __init__(self, url: str, folder: pathlib.Path) -> None:
+    def __init__(self, url: str, folder: pathlib.Path, *, look: bool) -> None:
         self.name, self.folder = url, folder
-        self._bucket = Bucket(url, make=True)
+        self._bucket = Bucket(url, make=True, look=look)
         self._entries: dict[str, Any] = {}  # of shards that are there, by name
 
     def begun(self) -> bool:
@@ -120,10 +122,14 @@ class Objects:
         self._bucket.put(accounting.ASKED, files.read_bytes(self.folder / accounting.ASKED))
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
-        """As `Place.counts`: shards that the manifest does not list are fetched to be looked at."""
-        there = self._bucket.list()
-        known = self._listed() | self._entries
-        names = {index: _name(index) for index in indices if _name(index) in there}
+        """As `Place.counts`: shards that the manifest does not list are fetched to be looked at.
+
+        A few cost a request each, however many there are in the bucket.
+        """
+        asked = {index: _name(index) for index in indices}
+        there = self._bucket.list() if len(asked) > FEW else self._described(asked.values())
+        names = {index: name for index, name in asked.items() if name in there}
+        known = (self._listed() if names else {}) | self._entries
         self._entries = {
             name: known[name] for name in names.values() if name in known and known[name]["bytes"] == there[name].size
         }
@@ -145,7 +151,7 @@ class Objects:
         names = {_name(index) for index in indices} & self._entries.keys()
         for name in names:
             del self._entries[name]
-        listed = self._listed()
+        listed = self._listed() if names else {}
         if names & listed.keys():
             self._write({name: entry for name, entry in listed.items() if name not in names})
 
@@ -169,6 +175,11 @@ class Objects:
         there = self._bucket.list()
         held = {name: known[name] for name in there if name in known and known[name]["bytes"] == there[name].size}
         return self._write(held)
+
+    def _described(self, names: Iterable[str]) -> dict[str, Found]:
+        """Return what there is of these objects, by name."""
+        found = {name: self._bucket.head(name) for name in names}
+        return {name: each for name, each in found.items() if each is not None}
 
     def _fetched(self, name: str) -> bytes:
         """Return the content of an object, which is then in the folder; nothing where there is none."""
@@ -205,8 +216,12 @@ def _name(index: int) -> str:
 
 
 @contextlib.contextmanager
-def opened(out: pathlib.Path) -> Iterator[Place]:
+def opened(out: pathlib.Path, *, look: bool = True) -> Iterator[Place]:
     """Return a context whose value is where a data set is written: the folder `out`, or what is at the URL.
+
+    Args:
+      out: the folder, or the URL.
+      look: whether to look first if a bucket can be listed, as `Bucket` does; a task's driver has done that.
 
     Raises:
       UserError: it cannot be written to.
@@ -217,7 +232,7 @@ def opened(out: pathlib.Path) -> Iterator[Place]:
         return
     with tempfile.TemporaryDirectory(prefix="dipn-datagen-") as folder:
         addresses.call(pathlib.Path(folder), url)
-        yield Objects(url, pathlib.Path(folder))
+        yield Objects(url, pathlib.Path(folder), look=look)
 
 
 def repair(url: str) -> list[pathlib.Path]:
