@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import fnmatch
 import pathlib
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -16,11 +17,9 @@ from typing import Any, Protocol
 from dipn_jax.commands import console
 from dipn_jax.storage import accounting, manifest, mirror, records, shards
 from dipn_jax.storage.manifest import MANIFEST
-from dipn_jax.storage.objects import Bucket, Found
+from dipn_jax.storage.objects import Bucket
 from dipn_jax.system import addresses, files, temporary
 
-SILENT_SHARDS = 20
-"""Number of shards below which no progress is shown while they are looked at."""
 FEW = 8
 """Number of shards up to which each is asked for by its name; for more of them, the whole bucket is listed."""
 Claim = Callable[[pathlib.Path], None]
@@ -54,8 +53,14 @@ class Place(Protocol):
     def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
         """Add a written shard and return its manifest entry, or that of another worker who was first."""
 
+    def names(self) -> set[str]:
+        """Return the names of the shards that are there."""
+
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
         """Write the manifest, with the entries of the shards that were made by their names, and return it."""
+
+    def list_whole(self, made: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any] | None:
+        """Do as `list` if all shards of these names are there, each with as many episodes; else return None."""
 
 
 class Folder:
@@ -90,6 +95,12 @@ class Folder:
 
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
         return manifest.update_manifest(self.folder, made=made)
+
+    def names(self) -> set[str]:
+        return {path.name for path in shards.shard_files(self.folder)}
+
+    def list_whole(self, made: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any] | None:
+        return manifest.update_whole(self.folder, made=made, sizes=sizes)
 
 
 class Objects:
@@ -127,21 +138,16 @@ class Objects:
         A few cost a request each, however many there are in the bucket.
         """
         asked = {index: _name(index) for index in indices}
-        there = self._bucket.list() if len(asked) > FEW else self._described(asked.values())
+        if len(asked) > FEW:
+            there = self._bucket.list()
+        else:
+            there = {name: found for name in asked.values() if (found := self._bucket.head(name))}
         names = {index: name for index, name in asked.items() if name in there}
         known = (self._listed() if names else {}) | self._entries
-        self._entries = {
-            name: known[name] for name in names.values() if name in known and known[name]["bytes"] == there[name].size
-        }
-        todo = [name for name in names.values() if name not in self._entries]
-        with (
-            console.Progress("look", len(todo), unit="shards", quiet=len(todo) < SILENT_SHARDS) as progress,
-            concurrent.futures.ThreadPoolExecutor(mirror.AT_ONCE) as pool,
-        ):
-            for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
-                self._entries |= {name: entry} if entry else {}
-                progress.advance(1)
-        return {index: int(self._entries[name]["episodes"]) for index, name in names.items() if name in self._entries}
+        listed = [name for name in names.values() if name in known and known[name]["bytes"] == there[name].size]
+        self._entries = {name: known[name] for name in listed}
+        self._entries |= self._look(name for name in names.values() if name not in self._entries)
+        return {index: self._entries[name]["episodes"] for index, name in names.items() if name in self._entries}
 
     def entry(self, index: int) -> dict[str, Any]:
         return dict(self._entries[_name(index)])
@@ -170,16 +176,36 @@ class Objects:
             (self.folder / name).unlink(missing_ok=True)
 
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
-        """As `Place.list`; of workers that end at the same time, the last one's counts, and readers find the rest."""
-        known = self._listed() | self._entries | dict(made)
-        there = self._bucket.list()
-        held = {name: known[name] for name in there if name in known and known[name]["bytes"] == there[name].size}
-        return self._write(held)
+        return self._write(self._held(made))
 
-    def _described(self, names: Iterable[str]) -> dict[str, Found]:
-        """Return what there is of these objects, by name."""
-        found = {name: self._bucket.head(name) for name in names}
-        return {name: each for name, each in found.items() if each is not None}
+    def names(self) -> set[str]:
+        return {name for name in self._bucket.list() if fnmatch.fnmatchcase(name, mirror.SHARDS)}
+
+    def list_whole(self, made: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any] | None:
+        """See `Place.list_whole`; shards of others are fetched to be looked at."""
+        held = self._held(made)
+        held |= self._look(name for name in sizes if name not in held)
+        return self._write(dict(sorted(held.items()))) if manifest.holds(held, sizes) else None
+
+    def _held(self, made: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the entries that are known of shards that are there, or that were made here."""
+        known, there = self._listed() | self._entries | dict(made), self._bucket.list()
+        sizes = {name: entry["bytes"] for name, entry in made.items()}  # the bucket may list them late
+        sizes |= {name: found.size for name, found in there.items()}
+        return {name: known[name] for name in sorted(sizes) if name in known and known[name]["bytes"] == sizes[name]}
+
+    def _look(self, names: Iterable[str]) -> dict[str, Any]:
+        """Fetch these shards, and return the entries of those that are there, by name."""
+        todo = [*names]
+        found: dict[str, Any] = {}
+        with (
+            console.Progress("look", len(todo), unit="shards", quiet=len(todo) < manifest.SILENT_SHARDS) as progress,
+            concurrent.futures.ThreadPoolExecutor(mirror.AT_ONCE) as pool,
+        ):
+            for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
+                found |= {name: entry} if entry else {}
+                progress.advance(1)
+        return found
 
     def _fetched(self, name: str) -> bytes:
         """Return the content of an object, which is then in the folder; nothing where there is none."""
@@ -209,6 +235,28 @@ class Objects:
         found = manifest.write(self.folder, entries)
         self._bucket.put(MANIFEST, files.read_bytes(self.folder / MANIFEST))
         return found
+
+
+def end(place: Place, made: Mapping[str, Any], *, sizes: Mapping[int, int], alone: bool) -> str:
+    """End a worker that has made its shards, and return the line that says what is there.
+
+    The only worker writes the manifest; one of several if the shards of all are there, so two may write the same.
+
+    Args:
+      place: the data set.
+      made: entries of the shards that this worker made, by name.
+      sizes: number of episodes of every shard of the data set.
+      alone: whether it is the only worker.
+    """
+    if alone:
+        listed: dict[str, Any] | None = place.list(made)
+    else:
+        named = {_name(index): size for index, size in sizes.items()}
+        there = (place.names() | made.keys()) & named.keys()
+        listed = place.list_whole(made, named) if len(there) == len(named) else None
+        if listed is None:
+            return f"{place.name}: {len(there)} of {len(named)} shards are there; the worker that ends last lists them"
+    return f"{place.name}: {listed['episodes']} {listed['kind']} episodes in {len(listed['shards'])} shards"
 
 
 def _name(index: int) -> str:

@@ -53,7 +53,9 @@ def test_it_is_made_continued_and_extended_as_in_a_folder(
     assert console.run("test", cli.COMMANDS, shorter) == 0 and len(_bytes(there)) == 5
     kept = (there / "shard-00000.parquet").stat().st_mtime_ns
     assert console.run("test", cli.COMMANDS, [*words, "--shard", "0", "--of", "2"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"file://{there}: 4 images episodes in 4 shards"
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        f"file://{there}: 4 of 6 shards are there; the worker that ends last lists them"
+    )
     assert console.run("test", cli.COMMANDS, ["verify", f"file://{there}"]) == 2
     (said,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error"))
     assert said.startswith(f"error: file://{there}: 4 of 6 episodes, shards 3, 5 missing: run `dipn-datagen images")
