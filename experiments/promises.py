@@ -150,6 +150,10 @@ PROMISES = (
         ),
     ),
     Promise(
+        "A machine of a Ray cluster whose file system fails does not end the job: its tasks are run again on another.",
+        ("tests/dipn_jax/commands/test_launch.py::test_what_the_files_of_a_machine_do_is_tried_again_elsewhere",),
+    ),
+    Promise(
         "In object storage each shard is kept once, however many workers make it, and a worker that is killed leaves "
         "complete shards only; the next worker completes the data set to that of one machine, byte for byte.",
         (

@@ -1,5 +1,7 @@
 """Tasks that are lost are run again, and a user's mistake ends the job; with a stand-in for Ray."""
 
+import errno
+import os
 import socket
 import sys
 import types
@@ -18,7 +20,7 @@ class _Ray(types.ModuleType):
     def __init__(self, cores: float = 2.0) -> None:
         super().__init__("ray")
         self.cores, self.options = cores, dict[str, Any]()
-        self.most_going, self.cancelled = 0, list[Any]()
+        self.most_going, self.cancelled, self.strategies = 0, list[Any](), list[str]()
         dead = {
             name: type(name, (Exception,), {}) for name in ("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError")
         }
@@ -35,14 +37,22 @@ class _Ray(types.ModuleType):
 
     def remote(self, **options: Any) -> Any:
         self.options = options
-        return lambda function: types.SimpleNamespace(remote=lambda *args: (function, args))
+
+        def made(function: Any) -> Any:
+            def options(*, scheduling_strategy: str) -> Any:
+                return types.SimpleNamespace(remote=lambda *args: (function, (*args, scheduling_strategy)))
+
+            return types.SimpleNamespace(remote=lambda *args: (function, (*args, "")), options=options)
+
+        return made
 
     def wait(self, going: list[Any], *, num_returns: int) -> tuple[list[Any], list[Any]]:
         self.most_going = max(self.most_going, len(going))
         return going[-num_returns:], going[:-num_returns]
 
     def get(self, task: Any) -> Any:
-        function, args = task
+        function, (*args, strategy) = task
+        self.strategies.append(strategy)
         return function(*args)
 
     def cancel(self, task: Any, *, force: bool) -> None:
@@ -53,14 +63,15 @@ class _Ray(types.ModuleType):
 def ray(monkeypatch: pytest.MonkeyPatch) -> _Ray:
     stand_in = _Ray()
     monkeypatch.setitem(sys.modules, "ray", stand_in)
+    monkeypatch.setattr(launch, "PAUSE", 0.0)
     return stand_in
 
 
 def _double(number: int) -> int:
     if number == 5:
         raise UserError("five: want another number")
-    if number == 6:
-        raise OSError(28, "No space left on device", "/data")
+    if number >= 100:
+        raise OSError(number - 100, os.strerror(number - 100), "/data")
     return 2 * number
 
 
@@ -74,11 +85,49 @@ def test_every_task_is_done_once_and_few_are_submitted_at_a_time(ray: _Ray) -> N
     assert ray.options["max_calls"] == 1
 
 
-@pytest.mark.parametrize(("number", "says"), [(5, "five: want another number"), (6, "/data: No space left on device")])
+@pytest.mark.parametrize(
+    ("number", "says"),
+    [
+        (5, "^five: want another number$"),
+        (100 + errno.ENOSPC, f"^on {socket.gethostname()}: /data: No space left on device; mend that and try again$"),
+        (100 + errno.EACCES, f"^on {socket.gethostname()}: /data: Permission denied; "),
+        (100 + errno.ENOENT, f"^on {socket.gethostname()}: /data: No such file or directory; "),
+    ],
+)
 def test_a_mistake_of_the_users_ends_the_job_and_the_others_are_given_up(number: int, says: str, ray: _Ray) -> None:
     with pytest.raises(UserError, match=says):
         list(launch.run(_double, [(1,), (2,), (number,), (3,), (4,)], launch=Launch("ray")))
-    assert [task[1] for _, task in ray.cancelled] == [(1,), (2,)]
+    assert [task for _, (_, task, _) in ray.cancelled] == [(1,), (2,)]
+
+
+@pytest.mark.parametrize("number", [errno.ESTALE, errno.EIO])
+@pytest.mark.parametrize("said", [False, True])
+def test_what_the_files_of_a_machine_do_is_tried_again_elsewhere(
+    number: int, said: bool, ray: _Ray, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether a task says so itself, or in a line for the user."""
+    calls: list[int] = []
+
+    def fails(times: int) -> int:
+        calls.append(times)
+        if calls.count(times) > times:
+            return -times
+        try:
+            raise OSError(number, os.strerror(number), "/data")
+        except OSError:
+            if said:
+                raise UserError("/data: cannot be read") from None
+            raise
+
+    found = dict(launch.run(fails, [(0,), (1,), (launch.RETRIES,)], launch=Launch("ray")))
+    assert found == {0: 0, 1: -1, 2: -launch.RETRIES}
+    assert sorted(calls) == [0, 1, 1, *[launch.RETRIES] * (launch.RETRIES + 1)]
+    assert ray.strategies.count("") == 3 and ray.strategies.count("SPREAD") == 1 + launch.RETRIES
+    what = "/data: cannot be read" if said else f"/data: {os.strerror(number)}"
+    line = f"fails: on {socket.gethostname()}: {what}"
+    assert capsys.readouterr().err == f"warning: {line}; tasks that fail there are run again\n"
+    with pytest.raises(UserError, match=f"^fails: failed {launch.RETRIES + 1} times, at last on .*: {what}$"):
+        list(launch.run(fails, [(launch.RETRIES + 1,)], launch=Launch("ray")))
 
 
 def test_a_task_whose_process_always_dies_ends_the_job(ray: _Ray) -> None:
@@ -87,7 +136,7 @@ def test_a_task_whose_process_always_dies_ends_the_job(ray: _Ray) -> None:
 
     with pytest.raises(UserError, match=r"dies: a task's process died 17 times \(segmentation fault\)"):
         list(launch.run(dies, [(1,), (2,)], launch=Launch("ray")))
-    assert [task[1] for _, task in ray.cancelled] == [(1,)]
+    assert [task for _, (_, task, _) in ray.cancelled] == [(1,)]
 
 
 def test_what_no_machine_has_is_said(ray: _Ray, capsys: pytest.CaptureFixture[str]) -> None:
