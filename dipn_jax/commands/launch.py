@@ -37,6 +37,8 @@ PAUSE = 5.0
 """Seconds that a task waits which a machine's files have failed, or a broken machine would take the others' tasks."""
 STORE_BYTES = 100 * 2**20
 """Memory for results of tasks, on a cluster that is started here: they are a few words."""
+PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
+"""Variable of the environment: whether JAX takes three quarters of a GPU's memory when it begins to compute."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +62,11 @@ class Launch:
     def spreads(self) -> bool:
         """Whether the job runs as tasks."""
         return self.launcher != "local"
+
+    def begin(self) -> None:
+        """Let this process leave a GPU's memory to the tasks of the job; to be called before JAX computes anything."""
+        if self.spreads:
+            _share_gpu()
 
     def threads(self, given: int | None) -> int | None:
         """Return the threads of the native engine: those given, or in a task one per core that it has reserved."""
@@ -88,8 +95,10 @@ def run(
     with _connected() as ray:
         _warn_of_too_little(ray, launch)
         needs = {"num_cpus": launch.num_cpus, "num_gpus": launch.num_gpus}
-        needs |= {"max_calls": 1} if fresh else {}
+        # 0: a process serves many tasks; with GPUs, Ray would begin one for each, which compiles everything again
+        needs |= {"max_calls": 1 if fresh else 0}
         remote = ray.remote(max_retries=RETRIES, retry_exceptions=False, **needs)(_attempt)
+        shares = not fresh or launch.num_gpus < 1
         elsewhere = remote.options(scheduling_strategy="SPREAD")  # on one machine after another
         waiting, going = collections.deque(enumerate(tasks)), dict[Any, tuple[int, Any]]()
         failed, broken = collections.Counter[int](), set[str]()
@@ -97,7 +106,7 @@ def run(
             while waiting or going:
                 while waiting and len(going) < _window(ray, launch):
                     number, task = waiting.popleft()
-                    going[(elsewhere if failed[number] else remote).remote(function, task)] = number, task
+                    going[(elsewhere if failed[number] else remote).remote(function, task, shares)] = number, task
                 for done in ray.wait(list(going), num_returns=1)[0]:
                     number, task = going.pop(done)
                     ended = _ended(ray, done, function)
@@ -141,9 +150,19 @@ def _ended(ray: Any, task: Any, function: Callable[..., Any]) -> _Ended:
     return ended
 
 
-def _attempt(function: Callable[..., Any], task: tuple[Any, ...]) -> _Ended:
-    """Return what a task returns, or the line that says what is wrong with the files; another error is raised."""
+def _share_gpu() -> None:
+    """Let JAX take the memory of a GPU as it needs it, unless the user has said otherwise."""
+    os.environ.setdefault(PREALLOCATE, "false")
+
+
+def _attempt(function: Callable[..., Any], task: tuple[Any, ...], shares: bool) -> _Ended:
+    """Return what a task returns, or the line that says what is wrong with the files; another error is raised.
+
+    It `shares` its GPU where another process may use that, too: one of another task, or one that waits for its next.
+    """
     console.prepare()
+    if shares:
+        _share_gpu()
     here = socket.gethostname()
     try:
         return _Ended(function(*task))
