@@ -248,14 +248,13 @@ def end(place: Place, made: Mapping[str, Any], *, sizes: Mapping[int, int], alon
       sizes: number of episodes of every shard of the data set.
       alone: whether it is the only worker.
     """
-    if alone:
-        listed: dict[str, Any] | None = place.list(made)
-    else:
-        named = {_name(index): size for index, size in sizes.items()}
-        there = (place.names() | made.keys()) & named.keys()
-        listed = place.list_whole(made, named) if len(there) == len(named) else None
-        if listed is None:
-            return f"{place.name}: {len(there)} of {len(named)} shards are there; the worker that ends last lists them"
+    named = {_name(index): size for index, size in sizes.items()}
+    there = named.keys() if alone else (place.names() | made.keys()) & named.keys()
+    listed = None
+    if len(there) == len(named):
+        listed = place.list(made) if alone else place.list_whole(made, named)
+    if listed is None:
+        return f"{place.name}: {len(there)} of {len(named)} shards are there; the worker that ends last lists them"
     return f"{place.name}: {listed['episodes']} {listed['kind']} episodes in {len(listed['shards'])} shards"
 
 
