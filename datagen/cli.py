@@ -58,6 +58,7 @@ def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *,
     """Generate what `job` says; `given` are the options that the command was called with, to be kept."""
     from .generate import generate
 
+    work.launch.begin()
     command = command_line.words(COMMANDS[job.kind], given, without=command_line.WORKER_OPTIONS)
     elsewhere = None
     if work.launch.spreads:
@@ -195,6 +196,7 @@ def _generate_guided(
 
     if not (guided >= 0 and hard >= 0 and 0 < guided + hard <= 1):
         raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
+    work.launch.begin()
     network: Any = checkpoint.load_network(given["grasp_net"], network="grasp")
     job = dataclasses.replace(job, guided=guided, hard=hard, weights=checkpoint.digest(network))
     _generate(job, out, work, given, scorer=scorers.aided_scorer(network))

@@ -208,11 +208,12 @@ def generate(
                 else:
                     _gather(elsewhere(job, todo, out), tally, made)
         except BaseException:
-            with contextlib.suppress(UserError, OSError):  # what ended the work is said
-                place.list(made)
+            if of == 1:
+                with contextlib.suppress(UserError, OSError):  # what ended the work is said
+                    place.list(made)
             raise
-        listed = place.list(made)
-    console.say(f"{place.name}: {listed['episodes']} {job.kind} episodes in {len(listed['shards'])} shards")
+        sizes = {index: job.size(index) for index in range(job.shards())}
+        console.say(places.end(place, made, sizes=sizes, alone=of == 1))
 
 
 def _gather(finished: Generator[tuple[str, dict[str, Any]], None, None], tally: _Tally, made: dict[str, Any]) -> None:

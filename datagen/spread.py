@@ -56,7 +56,7 @@ def make_shard(
     """
     if job.describe() != described:
         raise UserError(f"{out}: begun with {described.get('device')}, a task has {job.describe().get('device')}")
-    with places.opened(out) as place:
+    with places.opened(out, look=False) as place:
         if not place.begun():
             raise UserError(f"{out}: a task does not see it; give an --out that all machines of the cluster share")
         if place.counts([index]).get(index) == job.size(index):  # before the worker was lost

@@ -141,13 +141,19 @@ PROMISES = (
         ),
     ),
     Promise(
-        "When a node or a worker of a Ray cluster is lost, only its task is run again; data sets and evaluations are "
-        "those of one machine, byte for byte. (The tests are skipped where Ray is not installed.)",
+        "When a node or a worker of a Ray cluster is lost, only its task is run again; data sets, evaluations and the "
+        "weights of a sweep are those of one machine, byte for byte. (The tests are skipped where Ray is not "
+        "installed.)",
         (
             "tests/datagen/test_spread.py::test_nodes_and_workers_that_are_lost_change_nothing",
             "tests/datagen/test_spread.py::test_a_driver_that_is_killed_goes_on_when_it_is_started_again",
             "tests/eval/workers/test_launching.py::test_a_cluster_that_loses_nodes_makes_the_evaluation_of_one_machine",
+            "tests/test_on_cluster.py::test_a_sweep_whose_workers_are_killed_trains_the_networks_of_one_machine",
         ),
+    ),
+    Promise(
+        "A machine of a Ray cluster whose file system fails does not end the job: its tasks are run again on another.",
+        ("tests/dipn_jax/commands/test_launch.py::test_what_the_files_of_a_machine_do_is_tried_again_elsewhere",),
     ),
     Promise(
         "In object storage each shard is kept once, however many workers make it, and a worker that is killed leaves "

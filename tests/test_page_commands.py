@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import os
 import pathlib
+import shlex
 import socket
 import subprocess
 import sys
@@ -39,13 +40,8 @@ MADE = {
 
 
 def work(words: list[str]) -> int:
-    """Run a command and return its exit code: in this process, but one that starts Ray, in a process of its own.
-
-    Where Ray is not installed, that command is left out.
-    """
+    """Run a command and return its exit code: in this process, but one that starts Ray, in a process of its own."""
     if "ray" in words:
-        if importlib.util.find_spec("ray") is None:
-            return 0
         settings = {"RAY_USAGE_STATS_ENABLED": "0"}
         return subprocess.run(in_a_process(words), env=os.environ | settings, check=False).returncode
     return console.run(words[0], importlib.import_module(runs.PROGRAMS[words[0]]).COMMANDS, words[1:])
@@ -82,6 +78,7 @@ def test_the_commands_of_a_page_work_at_small_scale(
     if page.name == "your_cases.md":
         (tmp_path / "my_cases.json").write_text(page_commands.block(page, "json"))
     job: list[list[str]] = []
+    left_out: list[list[str]] = []
     for words in page_commands.commands(page):
         if job and "--coordinator" not in words:
             together(job)
@@ -91,6 +88,9 @@ def test_the_commands_of_a_page_work_at_small_scale(
         if not page_commands.ours(words):
             continue
         small = page_commands.smaller(words)
+        if "ray" in words and importlib.util.find_spec("ray") is None:
+            left_out.append(small)
+            continue
         for place in page_commands.is_read(small):
             before = page_commands.stand_in(place, data)
             assert before is None or work(page_commands.smaller(before)) == 0
@@ -109,6 +109,8 @@ def test_the_commands_of_a_page_work_at_small_scale(
         assert files.read_json(pathlib.Path("results/hard/metrics.json"))["instances"] == 1
     elif page.name == "sweep_distance.md":
         assert files.read_json(pathlib.Path("data/sweep/config.json"))["distances"] == [0.03, 0.06, 0.1]
+    if left_out:
+        pytest.skip(f"Ray is not installed, the others pass: {'; '.join(map(shlex.join, left_out))}")
 
 
 def test_every_option_of_a_page_is_kept_or_made_smaller() -> None:

@@ -1,16 +1,20 @@
 """Tasks of a job, on the machines of a Ray cluster. Importing this imports neither Ray nor JAX.
 
 A task writes its result to the folder that all machines share, and returns a few words about it. One that is lost, with
-its process or its machine, is run again, up to RETRIES times; a mistake of the user's ends the job with its line.
+its process or its machine, or that a file system of its machine fails, is run again, up to RETRIES times; a mistake of
+the user's ends the job with its line.
 """
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
+import errno
 import os
 import signal
 import socket
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, Literal
 
@@ -25,8 +29,16 @@ ANSWERS_WITHIN = 20.0
 """Seconds within which a cluster has to accept a connection."""
 RETRIES = 16
 """Times that a task is run again whose process or machine died: machines come and go, but a task can be at fault."""
+MISTAKES = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT)
+"""Errors of files that end the job: the user has to mend them. Others, as ESTALE, are taken for the machine's own."""
+BROKEN = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT)
+"""Errors of files that are the machine's own, too, where a UserError was made of them."""
+PAUSE = 5.0
+"""Seconds that a task waits which a machine's files have failed, or a broken machine would take the others' tasks."""
 STORE_BYTES = 100 * 2**20
 """Memory for results of tasks, on a cluster that is started here: they are a few words."""
+PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
+"""Variable of the environment: whether JAX takes three quarters of a GPU's memory when it begins to compute."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +63,11 @@ class Launch:
         """Whether the job runs as tasks."""
         return self.launcher != "local"
 
+    def begin(self) -> None:
+        """Let this process leave a GPU's memory to the tasks of the job; to be called before JAX computes anything."""
+        if self.spreads:
+            _share_gpu()
+
     def threads(self, given: int | None) -> int | None:
         """Return the threads of the native engine: those given, or in a task one per core that it has reserved."""
         return max(1, int(self.num_cpus)) if self.spreads and given is None else given
@@ -72,52 +89,96 @@ def run(
       fresh: give each task a process of its own, which ends with it.
 
     Raises:
-      UserError: a task raised it, or its process died each time, and the others are given up; or there is no Ray or no
-        cluster.
+      UserError: a task raised it, its process died each time, or files of its machine failed each time, and the others
+        are given up; or there is no Ray or no cluster.
     """
     with _connected() as ray:
         _warn_of_too_little(ray, launch)
         needs = {"num_cpus": launch.num_cpus, "num_gpus": launch.num_gpus}
-        needs |= {"max_calls": 1} if fresh else {}
+        # 0: a process serves many tasks; with GPUs, Ray would begin one for each, which compiles everything again
+        needs |= {"max_calls": 1 if fresh else 0}
         remote = ray.remote(max_retries=RETRIES, retry_exceptions=False, **needs)(_attempt)
-        waiting, going = list(enumerate(tasks))[::-1], dict[Any, int]()
+        shares = not fresh or launch.num_gpus < 1
+        elsewhere = remote.options(scheduling_strategy="SPREAD")  # on one machine after another
+        waiting, going = collections.deque(enumerate(tasks)), dict[Any, tuple[int, Any]]()
+        failed, broken = collections.Counter[int](), set[str]()
         try:
             while waiting or going:
                 while waiting and len(going) < _window(ray, launch):
-                    number, task = waiting.pop()
-                    going[remote.remote(function, task)] = number
+                    number, task = waiting.popleft()
+                    going[(elsewhere if failed[number] else remote).remote(function, task, shares)] = number, task
                 for done in ray.wait(list(going), num_returns=1)[0]:
-                    number = going.pop(done)
-                    yield number, _result(ray, done, function)
+                    number, task = going.pop(done)
+                    ended = _ended(ray, done, function)
+                    if ended.trouble is None:
+                        yield number, ended.result
+                        continue
+                    failed[number] += 1
+                    if failed[number] > RETRIES:
+                        raise UserError(f"{function.__name__}: failed {RETRIES + 1} times, at last {ended.trouble}")
+                    waiting.append((number, task))
+                    if ended.machine not in broken:
+                        broken.add(ended.machine)
+                        console.warn(f"{function.__name__}: {ended.trouble}; tasks that fail there are run again")
         finally:
             for left in going:
                 ray.cancel(left, force=True)
 
 
-def _result(ray: Any, task: Any, function: Callable[..., Any]) -> Any:
-    """Return the result of a task that has ended; raise UserError where it cannot be had."""
+@dataclasses.dataclass(frozen=True)
+class _Ended:
+    """How a task ended."""
+
+    result: Any = None
+    mistake: str | None = None  # what the user has to mend
+    trouble: str | None = None  # what the files of its machine did
+    machine: str = ""
+
+
+def _ended(ray: Any, task: Any, function: Callable[..., Any]) -> _Ended:
+    """Return how a task has ended; raise UserError where that is the end of the job."""
     try:
-        result, said = ray.get(task)
+        ended: _Ended = ray.get(task)
     except (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError, ray.exceptions.OutOfMemoryError) as error:
         why = " ".join(str(error).split())[:200]
         raise UserError(
             f"{function.__name__}: a task's process died {RETRIES + 1} times ({why}); see Ray's logs on that machine, "
             "and give tasks more memory or a smaller --shard-size"
         ) from None
-    if said is not None:
-        raise UserError(said)
-    return result
+    if ended.mistake is not None:
+        raise UserError(ended.mistake)
+    return ended
 
 
-def _attempt(function: Callable[..., Any], task: tuple[Any, ...]) -> tuple[Any, str | None]:
-    """Return what a task returns, or else the line that says what the user has to mend; another error is raised."""
+def _share_gpu() -> None:
+    """Let JAX take the memory of a GPU as it needs it, unless the user has said otherwise."""
+    os.environ.setdefault(PREALLOCATE, "false")
+
+
+def _attempt(function: Callable[..., Any], task: tuple[Any, ...], shares: bool) -> _Ended:
+    """Return what a task returns, or the line that says what is wrong with the files; another error is raised.
+
+    It `shares` its GPU where another process may use that, too: one of another task, or one that waits for its next.
+    """
     console.prepare()
+    if shares:
+        _share_gpu()
+    here = socket.gethostname()
     try:
-        return function(*task), None
+        return _Ended(function(*task))
     except UserError as error:
-        return None, addresses.named(str(error))
+        # `from None` hides what it was made of, and keeps it
+        passes = isinstance(error.__context__, OSError) and error.__context__.errno in BROKEN
+        said = str(error)
     except OSError as error:
-        return None, addresses.named(console.mended(error))
+        passes = error.errno not in MISTAKES
+        said = f"{error.filename or 'files'}: {error.strerror or error}"
+        said = said if passes else f"on {here}: {said}; mend that and try again"
+    said = addresses.named(said)
+    if not passes:
+        return _Ended(mistake=said)
+    time.sleep(PAUSE)
+    return _Ended(trouble=f"on {here}: {said}", machine=here)
 
 
 def _window(ray: Any, launch: Launch) -> int:

@@ -1,11 +1,13 @@
 """The list of a data set's shards: `manifest.json`, with their sizes and SHA-256.
 
-It is a function of the shards, and is written when generation ends. While generation runs, or where it was killed,
-there are shards that the manifest does not list: readers look for them and read them, too.
+It is a function of the shards, and is written when generation ends: by the only worker, or by each that finds all
+shards there. While generation runs, or where it was killed, there are shards that the manifest does not list: readers
+look for them and read them, too.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import functools
 import pathlib
@@ -15,7 +17,7 @@ from typing import Any
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import layout, shards
-from dipn_jax.system import files, typed
+from dipn_jax.system import files, machine, typed
 
 try:
     import fcntl
@@ -24,6 +26,8 @@ except ImportError:  # Windows
 
 MANIFEST = "manifest.json"
 """Name of the file that lists the shards of a data set."""
+SILENT_SHARDS = 20
+"""Number of shards below which no progress is shown while they are looked at."""
 _FORM = {
     "kind": typed.Maybe(set(layout.KINDS)),
     "shards": {
@@ -55,6 +59,24 @@ def update_manifest(folder: pathlib.Path, *, made: Mapping[str, Any] | None = No
         while not alone and set(manifest["shards"]) != {path.name for path in shards.shard_files(folder)}:
             manifest = _rebuild(folder, made or {})  # somebody whom no lock kept waiting has added a shard
         return manifest
+
+
+def update_whole(folder: pathlib.Path, *, made: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any] | None:
+    """Do as `update_manifest` if the data set is whole; else write nothing and return None.
+
+    Args:
+      folder: the data set.
+      made: entries by name, as for `update_manifest`.
+      sizes: episodes of every shard that was asked for, by name: one that is to be made longer is still missing.
+    """
+    with _turn(folder):
+        entries = _entries(folder, made)
+        return write(folder, entries) if holds(entries, sizes) else None
+
+
+def holds(entries: Mapping[str, Any], sizes: Mapping[str, int]) -> bool:
+    """Return whether all these shards are among the entries, each with as many episodes as `sizes` says."""
+    return all(name in entries and entries[name]["episodes"] == size for name, size in sizes.items())
 
 
 def forget(folder: pathlib.Path, names: Collection[str]) -> None:
@@ -89,14 +111,22 @@ def _warn_of_no_locks(folder: pathlib.Path) -> None:
 
 def _rebuild(folder: pathlib.Path, made: Mapping[str, Any]) -> dict[str, Any]:
     """Write the manifest anew, as `update_manifest` says, and return it."""
+    return write(folder, _entries(folder, made))
+
+
+def _entries(folder: pathlib.Path, made: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry of every shard that is there, by name and in order; those that are not known are read."""
     known = (_read(folder)["shards"] if (folder / MANIFEST).exists() else {}) | dict(made)
-    entries: dict[str, Any] = {}
-    for path in shards.shard_files(folder):
-        entry = known.get(path.name)
-        if entry is None or entry["bytes"] != path.stat().st_size:
-            entry = shards.entry(path)
-        entries[path.name] = entry
-    return write(folder, entries)
+    paths = shards.shard_files(folder)
+    todo = [path for path in paths if path.name not in known or known[path.name]["bytes"] != path.stat().st_size]
+    with (
+        console.Progress("look", len(todo), unit="shards", quiet=len(todo) < SILENT_SHARDS) as progress,
+        concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool,
+    ):
+        for path, entry in zip(todo, pool.map(shards.entry, todo), strict=True):
+            known[path.name] = entry
+            progress.advance(1)
+    return {path.name: known[path.name] for path in paths}
 
 
 def write(folder: pathlib.Path, entries: dict[str, Any]) -> dict[str, Any]:

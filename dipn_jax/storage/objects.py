@@ -43,12 +43,13 @@ class Found:
 class Bucket:
     """What is below a URL. Threads may share it, forked processes may not."""
 
-    def __init__(self, url: str, *, make: bool = False) -> None:
+    def __init__(self, url: str, *, make: bool = False, look: bool = True) -> None:
         """Open what is below a URL, and check that it can be listed.
 
         Args:
           url: from `addresses.url`.
           make: whether the folder of a file:// URL is made where there is none.
+          look: whether to look at all; without, the first use says that it cannot be used.
 
         Raises:
           UserError: it cannot be listed; obstore is not installed.
@@ -59,8 +60,8 @@ class Bucket:
         if not url.partition("://")[2].strip("/"):
             raise UserError(f"{url}: names no bucket; give one, as in {self.scheme}://BUCKET/FOLDER")
         with self._said():
-            for _ in self._listed(_opened(url, make=make, retry_config=FIRST_RETRIES)):
-                break
+            if look:
+                next(self._listed(_opened(url, make=make, retry_config=FIRST_RETRIES)), None)
             self._store = _opened(url, make=make)
 
     def list(self) -> dict[str, Found]:
@@ -69,6 +70,15 @@ class Bucket:
             pages = list(self._listed(self._store))
         found = {one["path"]: Found(one["size"], str(one["e_tag"])) for page in pages for one in page}
         return {name: found[name] for name in sorted(found) if "/" not in name}
+
+    def head(self, name: str) -> Found | None:
+        """Return what a list would say of an object, by one request; None where there is none."""
+        import obstore
+
+        with self._said(), contextlib.suppress(FileNotFoundError):
+            got = obstore.head(self._store, name)
+            return Found(got["size"], str(got["e_tag"]))
+        return None
 
     def get(self, name: str) -> tuple[bytes, Found] | None:
         """Return the content of an object; None where there is none."""

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import fnmatch
 import pathlib
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from dipn_jax.commands import console
@@ -19,8 +20,8 @@ from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.storage.objects import Bucket
 from dipn_jax.system import addresses, files, temporary
 
-SILENT_SHARDS = 20
-"""Number of shards below which no progress is shown while they are looked at."""
+FEW = 8
+"""Number of shards up to which each is asked for by its name; for more of them, the whole bucket is listed."""
 Claim = Callable[[pathlib.Path], None]
 """Writes the configuration of a data set to its folder, or raises UserError if another one is there."""
 
@@ -52,8 +53,14 @@ class Place(Protocol):
     def commit(self, index: int, entry: dict[str, Any]) -> dict[str, Any]:
         """Add a written shard and return its manifest entry, or that of another worker who was first."""
 
+    def names(self) -> set[str]:
+        """Return the names of the shards that are there."""
+
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
         """Write the manifest, with the entries of the shards that were made by their names, and return it."""
+
+    def list_whole(self, made: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any] | None:
+        """Do as `list` if all shards of these names are there, each with as many episodes; else return None."""
 
 
 class Folder:
@@ -89,13 +96,19 @@ class Folder:
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
         return manifest.update_manifest(self.folder, made=made)
 
+    def names(self) -> set[str]:
+        return {path.name for path in shards.shard_files(self.folder)}
+
+    def list_whole(self, made: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any] | None:
+        return manifest.update_whole(self.folder, made=made, sizes=sizes)
+
 
 class Objects:
     """A data set in object storage, and a temporary folder."""
 
-    def __init__(self, url: str, folder: pathlib.Path) -> None:
+    def __init__(self, url: str, folder: pathlib.Path, *, look: bool) -> None:
         self.name, self.folder = url, folder
-        self._bucket = Bucket(url, make=True)
+        self._bucket = Bucket(url, make=True, look=look)
         self._entries: dict[str, Any] = {}  # of shards that are there, by name
 
     def begun(self) -> bool:
@@ -120,22 +133,21 @@ class Objects:
         self._bucket.put(accounting.REQUEST_FILE, files.read_bytes(self.folder / accounting.REQUEST_FILE))
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
-        """As `Place.counts`: shards that the manifest does not list are fetched to be looked at."""
-        there = self._bucket.list()
-        known = self._listed() | self._entries
-        names = {index: _name(index) for index in indices if _name(index) in there}
-        self._entries = {
-            name: known[name] for name in names.values() if name in known and known[name]["bytes"] == there[name].size
-        }
-        todo = [name for name in names.values() if name not in self._entries]
-        with (
-            console.Progress("look", len(todo), unit="shards", quiet=len(todo) < SILENT_SHARDS) as progress,
-            concurrent.futures.ThreadPoolExecutor(mirror.PARALLEL_FETCHES) as pool,
-        ):
-            for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
-                self._entries |= {name: entry} if entry else {}
-                progress.advance(1)
-        return {index: int(self._entries[name]["episodes"]) for index, name in names.items() if name in self._entries}
+        """As `Place.counts`: shards that the manifest does not list are fetched to be looked at.
+
+        A few cost a request each, however many there are in the bucket.
+        """
+        asked = {index: _name(index) for index in indices}
+        if len(asked) > FEW:
+            there = self._bucket.list()
+        else:
+            there = {name: found for name in asked.values() if (found := self._bucket.head(name))}
+        names = {index: name for index, name in asked.items() if name in there}
+        known = (self._listed() if names else {}) | self._entries
+        listed = [name for name in names.values() if name in known and known[name]["bytes"] == there[name].size]
+        self._entries = {name: known[name] for name in listed}
+        self._entries |= self._look(name for name in names.values() if name not in self._entries)
+        return {index: self._entries[name]["episodes"] for index, name in names.items() if name in self._entries}
 
     def entry(self, index: int) -> dict[str, Any]:
         return dict(self._entries[_name(index)])
@@ -145,7 +157,7 @@ class Objects:
         names = {_name(index) for index in indices} & self._entries.keys()
         for name in names:
             del self._entries[name]
-        listed = self._listed()
+        listed = self._listed() if names else {}
         if names & listed.keys():
             self._write({name: entry for name, entry in listed.items() if name not in names})
 
@@ -164,11 +176,36 @@ class Objects:
             (self.folder / name).unlink(missing_ok=True)
 
     def list(self, made: Mapping[str, Any]) -> dict[str, Any]:
-        """As `Place.list`; if workers end at the same time, the last manifest stays; readers find the other shards."""
-        known = self._listed() | self._entries | dict(made)
-        there = self._bucket.list()
-        held = {name: known[name] for name in there if name in known and known[name]["bytes"] == there[name].size}
-        return self._write(held)
+        return self._write(self._held(made))
+
+    def names(self) -> set[str]:
+        return {name for name in self._bucket.list() if fnmatch.fnmatchcase(name, mirror.SHARDS)}
+
+    def list_whole(self, made: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, Any] | None:
+        """See `Place.list_whole`; shards of others are fetched to be looked at."""
+        held = self._held(made)
+        held |= self._look(name for name in sizes if name not in held)
+        return self._write(dict(sorted(held.items()))) if manifest.holds(held, sizes) else None
+
+    def _held(self, made: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the entries that are known of shards that are there, or that were made here."""
+        known, there = self._listed() | self._entries | dict(made), self._bucket.list()
+        sizes = {name: entry["bytes"] for name, entry in made.items()}  # the bucket may list them late
+        sizes |= {name: found.size for name, found in there.items()}
+        return {name: known[name] for name in sorted(sizes) if name in known and known[name]["bytes"] == sizes[name]}
+
+    def _look(self, names: Iterable[str]) -> dict[str, Any]:
+        """Fetch these shards, and return the entries of those that are there, by name."""
+        todo = [*names]
+        found: dict[str, Any] = {}
+        with (
+            console.Progress("look", len(todo), unit="shards", quiet=len(todo) < manifest.SILENT_SHARDS) as progress,
+            concurrent.futures.ThreadPoolExecutor(mirror.PARALLEL_FETCHES) as pool,
+        ):
+            for name, entry in zip(todo, pool.map(self._looked_at, todo), strict=True):
+                found |= {name: entry} if entry else {}
+                progress.advance(1)
+        return found
 
     def _fetched(self, name: str) -> bytes:
         """Return the content of an object, which is then in the folder; nothing where there is none."""
@@ -200,13 +237,38 @@ class Objects:
         return found
 
 
+def end(place: Place, made: Mapping[str, Any], *, sizes: Mapping[int, int], alone: bool) -> str:
+    """End a worker that has made its shards, and return the line that says what is there.
+
+    The only worker writes the manifest; one of several if the shards of all are there, so two may write the same.
+
+    Args:
+      place: the data set.
+      made: entries of the shards that this worker made, by name.
+      sizes: number of episodes of every shard of the data set.
+      alone: whether it is the only worker.
+    """
+    named = {_name(index): size for index, size in sizes.items()}
+    there = named.keys() if alone else (place.names() | made.keys()) & named.keys()
+    listed = None
+    if len(there) == len(named):
+        listed = place.list(made) if alone else place.list_whole(made, named)
+    if listed is None:
+        return f"{place.name}: {len(there)} of {len(named)} shards are there; the worker that ends last lists them"
+    return f"{place.name}: {listed['episodes']} {listed['kind']} episodes in {len(listed['shards'])} shards"
+
+
 def _name(index: int) -> str:
     return shards.shard_path(pathlib.Path(), index).name
 
 
 @contextlib.contextmanager
-def opened(out: pathlib.Path) -> Iterator[Place]:
+def opened(out: pathlib.Path, *, look: bool = True) -> Iterator[Place]:
     """Return a context whose value is where a data set is written: the folder `out`, or what is at the URL.
+
+    Args:
+      out: the folder, or the URL.
+      look: whether to look first if a bucket can be listed, as `Bucket` does; a task's driver has done that.
 
     Raises:
       UserError: it cannot be written to.
@@ -216,8 +278,8 @@ def opened(out: pathlib.Path) -> Iterator[Place]:
         yield Folder(out)
         return
     with tempfile.TemporaryDirectory(prefix="dipn-datagen-") as folder:
-        addresses.show_instead(pathlib.Path(folder), url)
-        yield Objects(url, pathlib.Path(folder))
+        addresses.call(pathlib.Path(folder), url)
+        yield Objects(url, pathlib.Path(folder), look=look)
 
 
 def repair(url: str) -> list[pathlib.Path]:

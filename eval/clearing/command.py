@@ -94,6 +94,7 @@ def clear(
         candidates=candidates, distances=distances, gamma=gamma, grasp_above=threshold, released=released, aids=aids
     )
     share.check(launch)
+    launch.begin()
     networks, physics = Networks(push_net, grasp_net, value_net), grouped.apart(make_engine(engine, threads=threads))
     if launch.spreads:
         launching.evaluate(

@@ -91,6 +91,7 @@ def sweep(
     evaluation.check(out, seed, tables, candidates=candidates, distances=every, gamma=gamma, threshold=threshold)
     chosen = PolicyConfig(candidates=candidates, distances=every, gamma=gamma, grasp_above=threshold, aids=aids)
     share.check(launch)
+    launch.begin()
     if pushes and share.of > pushes:
         raise UserError(f"--of {share.of}: more workers than --pushes {pushes}; want at most {pushes}, or --pushes 0")
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}

@@ -69,6 +69,7 @@ def grasp(
     if not grasp_net and not curve:
         raise UserError("grasp: nothing to measure; give --grasp-net or --curve")
     share.check(launch)
+    launch.begin()
     if not grasp_net and share.of > 1:
         raise UserError("--of: without --grasp-net there are no tables to share")
     from dipn_jax.physics import grouped, make_engine

@@ -61,6 +61,7 @@ def predict(
     settings = options.settings(asked)
     options.check(out, seed, scenes=scenes_)
     share.check(launch)
+    launch.begin()
     if not push_net and not curve:
         raise UserError("prediction: nothing to measure; give --push-net or --curve")
     from dipn_jax.physics import make_engine

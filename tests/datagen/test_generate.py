@@ -92,10 +92,10 @@ def test_an_interruption_loses_at_most_the_unfinished_shards(
     original = shards.write_shard
     job = dataclasses.replace(JOB, episodes=33)
 
-    def die_at_third(folder: pathlib.Path, index: int, *args: object, **options: object) -> None:
+    def die_at_third(folder: pathlib.Path, index: int, *args: Any, **options: Any) -> dict[str, Any]:
         if index == 2:
             raise KeyboardInterrupt
-        original(folder, index, *args, **options)  # type: ignore[arg-type]
+        return original(folder, index, *args, **options)
 
     monkeypatch.setattr(shards, "write_shard", die_at_third)
     with pytest.raises(KeyboardInterrupt):
@@ -115,8 +115,15 @@ def test_the_manifest_is_written_once_however_many_shards_there_are(
     write = manifest.write
     monkeypatch.setattr(manifest, "write", lambda at, entries: written.append(len(entries)) or write(at, entries))
     job = dataclasses.replace(JOB, kind="images", episodes=4, shard_size=1, actions=1)
-    generate(job, tmp_path)
+    generate(job, tmp_path / "alone")
     assert written == [4]
+    for part in (2, 0, 1):
+        assert not (tmp_path / "array" / manifest.MANIFEST).exists()
+        generate(job, tmp_path / "array", part=part, of=3)
+    assert written == [4, 4], "the last of several workers has written it"
+    assert (tmp_path / "array" / manifest.MANIFEST).read_bytes() == (
+        tmp_path / "alone" / manifest.MANIFEST
+    ).read_bytes()
 
 
 def test_a_data_set_whose_extension_is_killed_stays_whole(copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:

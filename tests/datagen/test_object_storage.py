@@ -1,5 +1,6 @@
 """Data sets in object storage are those of a folder, and every command reads them by their URL."""
 
+import collections
 import json
 import os
 import pathlib
@@ -7,16 +8,17 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import obstore
 import pytest
 from dipn_jax.datagen import cli
 from dipn_jax.train import cli as train
 
 from dipn_jax.commands import console, launch
 from dipn_jax.commands.launch import Launch
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, places
 from dipn_jax.storage.objects import Bucket
 
 WORDS = ("images", "--objects", "1", "--episodes", "6", "--shard-size", "1", "--engine", "native")
@@ -51,7 +53,9 @@ def test_it_is_made_continued_and_extended_as_in_a_folder(
     assert console.run("test", cli.COMMANDS, shorter) == 0 and len(_bytes(there)) == 5
     kept = (there / "shard-00000.parquet").stat().st_mtime_ns
     assert console.run("test", cli.COMMANDS, [*words, "--shard", "0", "--of", "2"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"file://{there}: 4 images episodes in 4 shards"
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        f"file://{there}: 4 of 6 shards are there; the worker that ends last lists them"
+    )
     assert console.run("test", cli.COMMANDS, ["verify", f"file://{there}"]) == 2
     (said,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error"))
     assert said.startswith(f"error: file://{there}: 4 of 6 episodes, shards 3, 5 missing: run `dipn-datagen images")
@@ -81,6 +85,35 @@ def test_tasks_make_it(alone: pathlib.Path, tmp_path: pathlib.Path, monkeypatch:
     assert console.run("test", cli.COMMANDS, [*WORDS, "--out", f"file://{tmp_path}/there", "--launcher", "ray"]) == 0
     assert _bytes(tmp_path / "there") == _bytes(alone)
     assert sorted(tried) == ["config.json", *(f"shard-{index:05d}.parquet" for index in range(6))], "made once"
+
+
+def test_what_a_job_asks_of_a_bucket_grows_by_its_shards_alone(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each task looks for its own shard; the bucket is listed, and its manifest read, a fixed number of times."""
+
+    def requests(episodes: int) -> collections.Counter[str]:
+        asked: collections.Counter[str] = collections.Counter()
+
+        def counting(name: str, request: Callable[..., Any]) -> Callable[..., Any]:
+            def counted(store: Any, *args: Any, **options: Any) -> Any:
+                asked[f"{name} shard" if str(args[:1]).startswith("('shard") else " ".join([name, *args[:1]])] += 1
+                return request(store, *args, **options)
+
+            return counted
+
+        words = [str(episodes) if word == "6" else word for word in WORDS]
+        with monkeypatch.context() as patch:
+            patch.setattr(launch, "run", lambda make, tasks, *, launch: enumerate(make(*task) for task in tasks))
+            for name in ("list", "get", "head", "put"):
+                patch.setattr(obstore, name, counting(name, getattr(obstore, name)))
+            out = f"file://{tmp_path}/{episodes}"
+            assert console.run("test", cli.COMMANDS, [*words, "--out", out, "--launcher", "ray"]) == 0
+        return asked
+
+    few, many = requests(places.FEW + 1), requests(places.FEW + 4)
+    assert many - few == {"get config.json": 3, "head shard": 3, "put shard": 3}
+    assert few["list"] == 3 and few["get manifest.json"] == 1
 
 
 def test_the_commands_read_it(

@@ -6,21 +6,42 @@ import contextlib
 import os
 import pathlib
 import signal
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
+
+STARTS_WITHIN = 180.0
+"""Seconds within which a node has to have started; Ray's own patience of 30 s is too short for a busy machine."""
 
 
 @contextlib.contextmanager
-def of_nodes(count: int) -> Iterator[Any]:
-    """Start a cluster of a head without cores and `count` nodes with one core each; connect to it."""
+def of_nodes(count: int, *, gpus: int = 0) -> Iterator[Any]:
+    """Start a cluster of a head without cores and `count` nodes with one core each; connect to it.
+
+    Others, `gpus` of them, have a core and what Ray takes for a GPU.
+    """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     import ray
     from ray.cluster_utils import Cluster
 
+    look = ray._private.services.get_node
+
+    def patient(*args: Any) -> Any:
+        until = time.monotonic() + STARTS_WITHIN
+        while time.monotonic() < until:
+            with contextlib.suppress(RuntimeError):
+                return look(*args)
+            time.sleep(0.1)
+        return look(*args)
+
     small = {"object_store_memory": 100 * 2**20}
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False, **small})
+    with mock.patch.object(ray._private.services, "get_node", patient):
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False, **small})
     try:
-        cluster.nodes = [cluster.add_node(num_cpus=1, **small) for _ in range(count)]
+        with mock.patch.object(ray._private.services, "get_node", patient):
+            own = [{"num_cpus": 1, "num_gpus": int(number >= count), **small} for number in range(count + gpus)]
+            cluster.nodes = [cluster.add_node(**each) for each in own]
         ray.init(cluster.address, log_to_driver=False, logging_level="ERROR")
         yield cluster
     finally:

@@ -23,11 +23,12 @@ def bucket(request: pytest.FixtureRequest, tmp_path: pathlib.Path, monkeypatch: 
 
 
 def test_an_object_is_created_once_and_read_back(bucket: Bucket) -> None:
-    assert bucket.list() == {} and bucket.get("x") is None
+    assert bucket.list() == {} and bucket.get("x") is None and bucket.head("x") is None
     assert bucket.create("x", b"first") and not bucket.create("x", b"second")
     assert bucket.create("sub/y", b"")
     data, found = bucket.get("x") or (b"", Found(0, ""))
     assert data == b"first" and bucket.list() == {"x": found} and found.size == 5
+    assert bucket.head("x") == found
     bucket.put("x", b"other")
     assert (bucket.get("x") or [b""])[0] == b"other" and bucket.list()["x"] != found
     bucket.delete("x")

@@ -68,6 +68,40 @@ def test_shards_that_are_not_listed_are_looked_at_and_then_listed(place: Place, 
         place.counts([0, 1])
 
 
+@pytest.mark.parametrize("url", ["", "file://"])
+def test_the_list_is_written_by_each_worker_that_finds_all_shards_there_and_by_no_other(
+    url: str, there: pathlib.Path
+) -> None:
+    """A shard that is to be made longer is missing, though there is one of its name."""
+    wanted = (there / "manifest.json").read_bytes()
+    (there / "manifest.json").unlink()
+    with places.opened(pathlib.Path(f"{url}{there}")) as place:
+        said = f"{place.name}: 2 of {{}} shards are there; the worker that ends last lists them"
+        assert places.end(place, {}, sizes={0: 16, 1: 8, 2: 8}, alone=False) == said.format(3)
+        assert places.end(place, {}, sizes={0: 16, 1: 16}, alone=False) == said.format(2)
+        assert not (there / "manifest.json").exists()
+        for _ in range(2):  # both end at the same moment
+            said = places.end(place, {}, sizes={0: 16, 1: 8}, alone=False)
+            assert said == f"{place.name}: 24 push episodes in 2 shards"
+            assert (there / "manifest.json").read_bytes() == wanted
+    assert shards.shard_files(place.folder) == ([] if url else shards.shard_files(there))
+
+
+def test_where_a_bucket_lists_a_shard_late_its_maker_knows_of_it_and_the_others_leave_the_list(
+    place: Place, there: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listing, late = Bucket.list, "shard-00001.parquet"
+    entry = manifest.entries(there)[late]
+    wanted = (there / "manifest.json").read_bytes()
+    (there / "manifest.json").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(Bucket, "list", lambda self: {k: v for k, v in listing(self).items() if k != late})
+        assert ": 1 of 2 shards are there; " in places.end(place, {}, sizes={0: 16, 1: 8}, alone=False)
+        assert not (there / "manifest.json").exists() and records.verify(there) == []
+        assert ": 24 push episodes in 2 " in places.end(place, {late: entry}, sizes={0: 16, 1: 8}, alone=False)
+    assert (there / "manifest.json").read_bytes() == wanted
+
+
 def test_of_two_that_begin_at_once_the_second_compares(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first one's configuration comes between the second's look and its own."""
     create = Bucket.create

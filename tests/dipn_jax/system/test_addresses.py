@@ -53,13 +53,18 @@ def test_lines_name_a_copy_by_its_url(capsys: pytest.CaptureFixture[str], tmp_pa
     assert output.err == "warning: run `dipn-datagen repair s3://bucket/data`\n"
 
 
-def test_a_task_says_the_url_of_its_copy(tmp_path: pathlib.Path) -> None:
+def test_a_task_says_the_url_of_its_copy(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It has names of its own, which the command that gets its line does not know."""
     addresses.show_instead(tmp_path, "s3://bucket/data")
 
     def failing(error: Exception) -> None:
         raise error
 
-    assert launch._attempt(failing, (UserError(f"{tmp_path}: begun"),)) == (None, "s3://bucket/data: begun")
-    result, said = launch._attempt(failing, (OSError(28, "No space left", str(tmp_path)),))
-    assert result is None and str(said).startswith("s3://bucket/data: No space left")
+    monkeypatch.setenv(launch.PREALLOCATE, "false")
+    for error, says in (
+        (UserError(f"{tmp_path}: begun"), "s3://bucket/data: begun"),
+        (OSError(28, "No space left", str(tmp_path)), "s3://bucket/data: No space left; mend that and try again"),
+    ):
+        ended = launch._attempt(failing, (error,), True)
+        assert ended.result is None and ended.trouble is None and str(ended.mistake).endswith(says)
+        assert str(tmp_path) not in str(ended.mistake)
