@@ -278,7 +278,7 @@ def opened(out: pathlib.Path, *, look: bool = True) -> Iterator[Place]:
         yield Folder(out)
         return
     with tempfile.TemporaryDirectory(prefix="dipn-datagen-") as folder:
-        addresses.call(pathlib.Path(folder), url)
+        addresses.show_instead(pathlib.Path(folder), url)
         yield Objects(url, pathlib.Path(folder), look=look)
 
 
