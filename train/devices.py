@@ -26,8 +26,6 @@ WAIT_LIMIT_SECONDS = 300
 """Seconds that a process waits for the others of its job."""
 WAIT_NOTICE_SECONDS = 10
 """Seconds after which it says that it does."""
-OWN_GPUS = ("SLURM_GPUS_PER_TASK", "SLURM_TRES_PER_TASK")
-"""Variables of SLURM that say that each process has GPUs of its own."""
 
 
 class OneDevice:
@@ -160,11 +158,12 @@ def local_devices(environment: Mapping[str, str]) -> list[int] | None:
       The numbers; None where the variables do not say how many GPUs or processes there are, or where the processes
       cannot share equally: then JAX decides.
     """
-    local = environment.get("SLURM_LOCALID", environment.get("OMPI_COMM_WORLD_LOCAL_RANK", ""))
+    local = environment.get("OMPI_COMM_WORLD_LOCAL_RANK", environment.get("SLURM_LOCALID", ""))
     count, here = _visible_gpus(environment), _processes_here(environment)
     if not count or not here or not local.isdecimal():
         return None
-    if here == 1 or count < here or any(name in environment for name in OWN_GPUS):
+    own = "SLURM_GPUS_PER_TASK" in environment or "gpu" in environment.get("SLURM_TRES_PER_TASK", "")
+    if here == 1 or count < here or own:
         return list(range(count))
     share = count // here
     return None if count % here else list(range(int(local) * share, (int(local) + 1) * share))

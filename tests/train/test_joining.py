@@ -86,6 +86,20 @@ def test_a_process_joins_others_where_a_job_manager_started_several(monkeypatch:
             "SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=2 CUDA_VISIBLE_DEVICES=0,1 SLURM_GPUS_PER_TASK=2",
             [0, 1],
         ),
+        (  # SLURM says so, too, where only cores were asked for
+            "SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=2 CUDA_VISIBLE_DEVICES=0,1 "
+            "SLURM_TRES_PER_TASK=cpu:4",
+            [1],
+        ),
+        (
+            "SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=2 CUDA_VISIBLE_DEVICES=0,1 "
+            "SLURM_TRES_PER_TASK=cpu:4,gres/gpu:2",
+            [0, 1],
+        ),
+        (  # mpirun in a job of SLURM, whose variables are then those of mpirun itself
+            "SLURM_LOCALID=0 OMPI_COMM_WORLD_LOCAL_RANK=1 OMPI_COMM_WORLD_LOCAL_SIZE=2 CUDA_VISIBLE_DEVICES=0,1",
+            [1],
+        ),
         ("OMPI_COMM_WORLD_LOCAL_RANK=1 OMPI_COMM_WORLD_LOCAL_SIZE=2 CUDA_VISIBLE_DEVICES=4,5,6,7", [2, 3]),
         ("SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=3 CUDA_VISIBLE_DEVICES=0,1,2,3", None),
         ("SLURM_LOCALID=1 SLURM_NODEID=0 SLURM_STEP_TASKS_PER_NODE=odd CUDA_VISIBLE_DEVICES=0,1", None),
