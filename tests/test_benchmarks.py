@@ -76,6 +76,8 @@ def test_the_page_of_large_data_sets_shows_the_figures_in_docs() -> None:
     one, key = [f"{fast[f'train.first_step/{what}']:.0f}" for what in ("seconds", "seconds_in_files")], "megabytes"
     size, small = (f"{fast[f'train.first_step/{key}{end}'] / 1000:.1f} GB" for end in ("", "_in_files"))
     assert f"takes {one[0]} s and {size} of memory, and with `--memory 0.1` {one[1]} s and {small}" in at
+    first = [f"{fast[f'train.first_step/seconds_to_step{end}']:.0f} s" for end in ("", "_in_files")]
+    assert f"its first step is over after {' and '.join(first)}" in at
     gpu = json.loads((DOCS / "benchmarks-h200.json").read_text())
     cores = gpu["machine"]["cores"]
     most = {
