@@ -103,7 +103,7 @@ def test_it_makes_the_evaluation_of_one_machine(
 def test_a_sweep_whose_workers_are_killed_trains_the_networks_of_one_machine(
     cluster: Any, data: dict[str, pathlib.Path], tmp_path: pathlib.Path
 ) -> None:
-    """They are killed when the first training has written a checkpoint, and go on from there."""
+    """They are killed when the first training has written a checkpoint, and continue from there."""
     import ray_cluster
 
     killed: list[int] = []

@@ -222,6 +222,7 @@ def test_speed_and_memory_are_said_beside_the_losses(tmp_path: pathlib.Path, mon
     now += 1
     curve.pause(10)
     now += 50  # evaluated
+    curve.pause(10)
     said = curve.write(10, {"loss": 0.5})
     name, rate, other, memory = said.split()
     assert (name, rate, other) == ("examples_per_s", "18", "peak_memory_mb") and float(memory) > 100
