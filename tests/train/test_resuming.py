@@ -104,7 +104,7 @@ def test_a_step_that_cannot_be_saved_ends_the_run_with_one_line(
 
     monkeypatch.setattr(checkpoint, "_write", full)
     assert console.exit_code(lambda: bool(fit(task, BRIEF, tmp_path)) and 0) == 2
-    errors = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert errors == [f"error: step {step} cannot be saved (No space left on device)"]
     found = checkpoint.newest(tmp_path)
     assert (found and found[1]["step"]) == (None if step == 3 else 3)
