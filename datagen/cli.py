@@ -138,7 +138,7 @@ def grasp(
     shard_size: int = 600,
     grasp_net: pathlib.Path | None = None,
     guided: float | None = None,
-    hard: float | None = None,
+    unsure: float | None = None,
     ranges: Ranges = DEFAULT_RANGES,
     work: Work = DEFAULT_WORK,
 ) -> None:
@@ -159,12 +159,12 @@ def grasp(
       shard_size: episodes in a file.
       grasp_net: run of dipn-train, or builtin; none: all grasps are random.
       guided: share of grasps that it scores high, 0.5 unless given.
-      hard: share of grasps that it is unsure of, 0.25 unless given.
+      unsure: share of grasps that it is unsure of, 0.25 unless given.
       ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
-    if grasp_net is None and (guided is not None or hard is not None):
-        raise UserError("--guided and --hard are shares of grasps that a network chooses: give --grasp-net, too")
+    if grasp_net is None and (guided is not None or unsure is not None):
+        raise UserError("--guided and --unsure are shares of grasps that a network chooses: give --grasp-net, too")
     given = dict(locals())
     from dipn_jax.world import scenes
 
@@ -183,22 +183,22 @@ def grasp(
     if grasp_net is None:
         _generate(job, out, work, given)
     else:
-        guided, hard = (value if given is None else given for given, value in ((guided, 0.5), (hard, 0.25)))
-        _generate_guided(job, out, work, given, guided=guided, hard=hard)
+        guided, unsure = (value if given is None else given for given, value in ((guided, 0.5), (unsure, 0.25)))
+        _generate_guided(job, out, work, given, guided=guided, unsure=unsure)
 
 
 def _generate_guided(
-    job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *, guided: float, hard: float
+    job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *, guided: float, unsure: float
 ) -> None:
-    """Generate grasps, the shares `guided` and `hard` of which a network chooses."""
+    """Generate grasps, the shares `guided` and `unsure` of which a network chooses."""
     from dipn_jax.planning import scorers
     from dipn_jax.storage import checkpoint
 
-    if not (guided >= 0 and hard >= 0 and 0 < guided + hard <= 1):
-        raise UserError(f"--guided {guided:g} --hard {hard:g}: want two shares whose sum is over 0 and at most 1")
+    if not (guided >= 0 and unsure >= 0 and 0 < guided + unsure <= 1):
+        raise UserError(f"--guided {guided:g} --unsure {unsure:g}: want two shares whose sum is over 0 and at most 1")
     work.launch.begin()
     network: Any = checkpoint.load_network(given["grasp_net"], network="grasp")
-    job = dataclasses.replace(job, guided=guided, hard=hard, weights=checkpoint.digest(network))
+    job = dataclasses.replace(job, guided=guided, unsure=unsure, weights=checkpoint.digest(network))
     _generate(job, out, work, given, scorer=scorers.aided_scorer(network))
 
 

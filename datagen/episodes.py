@@ -92,7 +92,7 @@ class Guide:
 
     scorer: Scorer
     guided: float  # share of grasps that it scores high
-    hard: float  # share of grasps that it is unsure of
+    unsure: float  # share of grasps that it is unsure of
 
 
 def grasp_batch(
@@ -139,7 +139,7 @@ def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
         if guide is None:
             return candidates.random_grasps(args[0], seen, count=actions)
         scores = guide.scorer(render.rgbd(seen)[None])[0]
-        return candidates.sample_grasps(args[0], seen, scores, count=actions, guided=guide.guided, hard=guide.hard)
+        return candidates.sample_grasps(args[0], seen, scores, count=actions, guided=guide.guided, unsure=guide.unsure)
 
     return jax.lax.map(one, (keys, scene, poses))
 

@@ -41,6 +41,8 @@ MAX_ATTEMPTS = 100
 """Batches without a single usable episode after which a shard is given up."""
 MAX_ACTIONS = 256
 """Actions that may be tried on one scene."""
+STORED_AS = {"unsure": "hard"}
+"""Fields of a job that have another name in `config.json` and in shards, where data sets in use have it."""
 SHARDS_AT_ONCE = 2
 """Shards that are made at the same time: one uses the cores that the other leaves idle."""
 
@@ -59,7 +61,7 @@ class Job:
     timestep: float | None = None  # seconds; the engine's own if None
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,)  # metres: each push is made once for every one of them
     guided: float = 0.0  # share of grasps that a network scores high
-    hard: float = 0.0  # share of grasps that the network is unsure of
+    unsure: float = 0.0  # share of grasps that the network is unsure of
     weights: str = ""  # SHA-256 of that network
 
     def __post_init__(self) -> None:
@@ -89,7 +91,8 @@ class Job:
     def describe(self) -> dict[str, Any]:
         """Return the job as it is written beside the shards; with the kind of device if batches depend on it."""
         device = {} if self.engine == "native" else {"device": jax.default_backend()}
-        return json.loads(json.dumps(dataclasses.asdict(self))) | device
+        fields = {STORED_AS.get(name, name): value for name, value in dataclasses.asdict(self).items()}
+        return json.loads(json.dumps(fields)) | device
 
     def size(self, index: int) -> int:
         """Return the number of episodes of shard `index`."""
@@ -117,7 +120,7 @@ class _Tally:
 
 def _maker(job: Job, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
     """Return the function that makes a batch of episodes of `job`: (key, engine, scenes, *, count)."""
-    guide = episodes.Guide(scorer, job.guided, job.hard) if scorer else None
+    guide = episodes.Guide(scorer, job.guided, job.unsure) if scorer else None
     makers: dict[str, Callable[..., episodes.Batch]] = {
         "push": functools.partial(episodes.push_batch, actions=job.actions, distances=job.distances),
         "grasp": functools.partial(episodes.grasp_batch, actions=job.actions, guide=guide),
@@ -177,7 +180,7 @@ def generate(
       part: number of this worker.
       of: number of workers.
       threads: that `native` simulates on; shards are then made one at a time, so that no more are used.
-      scorer: the network of `job.weights`, for guided and hard grasps.
+      scorer: the network of `job.weights`, for guided and unsure grasps.
       command: what makes the data set, as `accounting.note` keeps it.
       elsewhere: makes the shards on other machines; all are made here if not given.
 

@@ -59,20 +59,20 @@ def _shipped(run: Recipe, pretrained: pathlib.Path) -> None:
     once = run("once", train, first, "--steps 1500 --learning-rate 2e-3 --init", pretrained)
 
     chosen = "dipn-datagen grasp --actions 8 --objects"
-    second = run("second", chosen, "1:20 --episodes 6000 --seed 1 --guided 0.6 --hard 0.3 --grasp-net", once)
+    second = run("second", chosen, "1:20 --episodes 6000 --seed 1 --guided 0.6 --unsure 0.3 --grasp-net", once)
     twice = run("twice", train, [first, second], "--steps 2500 --learning-rate 2e-3 --init", pretrained)
 
     # packed rows, in which GN was too sure of itself
-    packed = "3:8 --packed 1 --episodes 9000 --seed 5 --guided 0.6 --hard 0.3 --grasp-net"
+    packed = "3:8 --packed 1 --episodes 9000 --seed 5 --guided 0.6 --unsure 0.3 --grasp-net"
     third = run("third", chosen, packed, twice)
     thrice = run("thrice", train, [first, second, third], "--steps 3500 --learning-rate 2e-3 --init", pretrained)
 
-    packed = "3:8 --packed 1 --episodes 8000 --seed 7 --guided 0.7 --hard 0.25 --grasp-net"
+    packed = "3:8 --packed 1 --episodes 8000 --seed 7 --guided 0.7 --unsure 0.25 --grasp-net"
     fourth = run("fourth", chosen, packed, thrice)
     rates = "--steps 3000 --learning-rate 1.5e-3 --init"
     fourfold = run("fourfold", train, [first, second, third, fourth], rates, thrice)
 
-    packed = "3:9 --packed 0.8 --episodes 6000 --seed 9 --guided 0.7 --hard 0.25 --grasp-net"
+    packed = "3:9 --packed 0.8 --episodes 6000 --seed 9 --guided 0.7 --unsure 0.25 --grasp-net"
     fifth = run("fifth", chosen, packed, fourfold)
     rates = "--steps 2200 --learning-rate 1e-3 --init"
     run("shipped", train, [first, second, third, fourth, fifth], rates, fourfold)

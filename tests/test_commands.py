@@ -93,9 +93,9 @@ def test_ranges_and_distances_that_contradict_themselves(call, tmp_path: pathlib
 
 def test_grasps_that_contradict_themselves(call, tmp_path: pathlib.Path) -> None:
     guided = ("datagen", "grasp", "--grasp-net", tmp_path, "--out", tmp_path / "d")
-    _one_line(call(*guided, "--guided", 0.8, "--hard", 0.5), "--guided 0.8 --hard 0.5")
+    _one_line(call(*guided, "--guided", 0.8, "--unsure", 0.5), "--guided 0.8 --unsure 0.5")
     random = ("datagen", "grasp", "--out", tmp_path / "d")
-    _one_line(call(*random, "--hard", 0.5), "give --grasp-net")
+    _one_line(call(*random, "--unsure", 0.5), "give --grasp-net")
     _one_line(call(*guided), "no whole step under checkpoints/")
     _one_line(call("train", "grasp-online", "--out", tmp_path / "r", "--tables", 0), "--tables 0")
     _one_line(call("eval", "grasp", "--out", tmp_path / "e"), "give --grasp-net or --curve")

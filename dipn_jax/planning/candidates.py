@@ -148,7 +148,7 @@ def sample_grasps(
     *,
     count: int,
     guided: Float[Array, ""] | float,
-    hard: Float[Array, ""] | float,
+    unsure: Float[Array, ""] | float,
 ) -> Grasp:
     """Draw `count` grasps: some with the highest scores, some with uncertain ones, the others at random.
 
@@ -158,7 +158,7 @@ def sample_grasps(
       scores: `[16, H, W]` in [0, 1].
       count: number of grasps.
       guided: share of grasps drawn in proportion to the squared odds of the score, traced.
-      hard: share drawn in proportion to the squared variance, (score x (1 - score))^2, traced.
+      unsure: share drawn in proportion to the squared variance, (score x (1 - score))^2, traced.
     """
     kind_key, draw_key, random_key = jax.random.split(key, 3)
     kind = jax.random.uniform(kind_key, (count,))
@@ -174,7 +174,7 @@ def sample_grasps(
     chosen, anywhere = grasp_at(index, observation.height), random_grasps(random_key, observation, count=count)
 
     def pick(one: jax.Array, other: jax.Array) -> jax.Array:
-        return jnp.where((kind < guided + hard).reshape(-1, *[1] * (one.ndim - 1)), one, other)
+        return jnp.where((kind < guided + unsure).reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
     return jax.tree.map(pick, chosen, anywhere)
 

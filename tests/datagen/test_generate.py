@@ -152,6 +152,13 @@ def test_another_config_in_the_same_folder_is_refused(copy: pathlib.Path) -> Non
     assert sorted((p.name, p.read_bytes()) for p in copy.iterdir()) == before
 
 
+def test_what_determines_a_data_set_is_stored_under_the_names_that_data_sets_in_use_have() -> None:
+    assert set(JOB.describe()) == {
+        "kind", "scene", "episodes", "seed", "shard_size", "actions", "engine", "timestep", "distances", "guided",
+        "hard", "weights",
+    }  # fmt: skip
+
+
 def test_a_data_set_can_grow(copy: pathlib.Path) -> None:
     generate(dataclasses.replace(JOB, episodes=32), copy)
     assert len(records.load(copy, kind="push")[0].fault) == 32

@@ -86,8 +86,8 @@ def test_guided_grasps_are_where_the_scores_are_high_and_hard_ones_where_they_ar
     scores = jnp.full((16, 224, 224), 1e-3).at[5, 60:64, 60:64].set(0.99).at[9, 120:124, 120:124].set(0.5)
     scores = scores.at[2, :40, :40].set(0.999)  # on the table: nothing to grasp
 
-    def rotations(guided: float, hard: float) -> np.ndarray:
-        taken = candidates.sample_grasps(jax.random.key(0), seen, scores, count=16, guided=guided, hard=hard)
+    def rotations(guided: float, unsure: float) -> np.ndarray:
+        taken = candidates.sample_grasps(jax.random.key(0), seen, scores, count=16, guided=guided, unsure=unsure)
         return np.asarray(candidates.grasp_index(taken))[:, 0]
 
     assert (rotations(1.0, 0.0) == 5).mean() > 0.9

@@ -130,7 +130,7 @@ def _given(arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> tuple
         ("push --out=x --distances 0.03 0.1 --timestep 0.001", "push --distances 0.03 0.1 --timestep 0.001"),
         ("grasp --out x --objects 1:7 --items triangle concave --scale 0.9 1", None),
         ("images --out x --engine native --seed 3 --color-noise 0.1", None),
-        ("grasp --out x --grasp-net builtin --hard 0.5", "grasp --grasp-net builtin --hard 0.5"),
+        ("grasp --out x --grasp-net builtin --unsure 0.5", "grasp --grasp-net builtin --unsure 0.5"),
     ],
 )
 def test_the_command_that_is_kept_asks_for_the_same(
