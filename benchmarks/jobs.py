@@ -14,7 +14,7 @@ from collections.abc import Generator, Iterator, Sequence
 from typing import Any
 from unittest import mock
 
-from dipn_jax.datagen import generate, spread
+from dipn_jax.datagen import generate, shard_tasks
 from dipn_jax.datagen.generate import Job
 
 from benchmarks.harness import Setting, Skipped, quiet, seconds
@@ -38,10 +38,10 @@ def _one_push() -> tuple[Any, dict[str, int]]:
 
 
 def make_shard(*arguments: Any) -> tuple[str, dict[str, Any]]:
-    """Make and write a shard as `spread.make_shard` does, but simulate nothing: the task of a job."""
+    """Make and write a shard as `shard_tasks.make_shard` does, but simulate nothing: the task of a job."""
     push = _one_push()
     with mock.patch.object(generate, "shard", lambda *_: push):
-        return spread.make_shard(*arguments)
+        return shard_tasks.make_shard(*arguments)
 
 
 def _do_nothing(index: int) -> int:

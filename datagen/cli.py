@@ -62,9 +62,9 @@ def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *,
     command = command_line.words(COMMANDS[job.kind], given, without=command_line.WORKER_OPTIONS)
     elsewhere = None
     if work.launch.spreads:
-        from . import spread
+        from . import shard_tasks
 
-        elsewhere = spread.elsewhere(work.launch, threads=work.threads, network=given.get("grasp_net"))
+        elsewhere = shard_tasks.elsewhere(work.launch, threads=work.threads, network=given.get("grasp_net"))
     generate(
         job,
         out,

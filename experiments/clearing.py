@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from dipn_jax.system import files
 from experiments import clearing_tables, command, grasping, pages
-from experiments.kept import Kept
+from experiments.kept_results import Kept
 from experiments.runs import Part, Recipe, Run
 
 KEPT = pages.DOCS / "clearing-tables.json"

@@ -13,7 +13,7 @@ from dipn_jax.eval.report import paper
 from dipn_jax.commands import markdown
 from dipn_jax.names import ALL_AIDS, MethodName
 from experiments import runs
-from experiments.kept import Kept
+from experiments.kept_results import Kept
 from experiments.runs import Run
 
 Trainings = dict[str, list[lockstep.Outcome]]

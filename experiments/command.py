@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Callable, Sequence
 
 from dipn_jax.commands import console
-from experiments import kept, runs
+from experiments import kept_results, runs
 from experiments.runs import Run
 
 ListRuns = Callable[[pathlib.Path], list[Run]]
@@ -52,8 +52,8 @@ def main(
             return 0
         found, after = runs.keys(listed), _forget
         if keep_in:
-            results = kept.Kept(keep_in)
-            chosen, after = kept.missing(listed, options.only, found, results), results.keep
+            results = kept_results.Kept(keep_in)
+            chosen, after = kept_results.missing(listed, options.only, found, results), results.keep
         if options.dry_run:
             return _rehearse(chosen, found)
         console.require_out(options.out)

@@ -145,8 +145,8 @@ PROMISES = (
         "weights of a sweep are those of one machine, byte for byte. (The tests are skipped where Ray is not "
         "installed.)",
         (
-            "tests/datagen/test_spread.py::test_nodes_and_workers_that_are_lost_change_nothing",
-            "tests/datagen/test_spread.py::test_a_driver_that_is_killed_goes_on_when_it_is_started_again",
+            "tests/datagen/test_shard_tasks.py::test_nodes_and_workers_that_are_lost_change_nothing",
+            "tests/datagen/test_shard_tasks.py::test_a_driver_that_is_killed_goes_on_when_it_is_started_again",
             "tests/eval/workers/test_launching.py::test_a_cluster_that_loses_nodes_makes_the_evaluation_of_one_machine",
             "tests/test_on_cluster.py::test_a_sweep_whose_workers_are_killed_trains_the_networks_of_one_machine",
         ),

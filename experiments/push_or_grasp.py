@@ -3,8 +3,8 @@
     python -m experiments.push_or_grasp --out results/push-or-grasp
 
 Ten minutes on 2 cores. The states are the first of each table on which no grasp scores over 0.7, of tables that only
-set the constants of `dipn_jax/planning/outlook.py`: the ten hard ones at a seed of their own, and packed rows of large
-blocks. Writes `states.json`, and with `--page` the table of docs/clearing.md and docs/push-or-grasp.json.
+set the constants of `dipn_jax/planning/expected_misses.py`: the ten hard ones at a seed of their own, and packed rows
+of large blocks. Writes `states.json`, and with `--page` the table of docs/clearing.md and docs/push-or-grasp.json.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dipn_jax.eval.clearing.tables import Tables
 from dipn_jax.commands import console, markdown
 from dipn_jax.engine import Engine
 from dipn_jax.physics import make_engine
-from dipn_jax.planning import outlook, scorers
+from dipn_jax.planning import expected_misses, scorers
 from dipn_jax.planning.memory import MissedGrasps
 from dipn_jax.planning.methods import Networks
 from dipn_jax.planning.policy_config import PolicyConfig
@@ -82,7 +82,7 @@ def compare(engine: Engine, tables: Tables, out: pathlib.Path) -> list[dict[str,
 
 def _first_unsure(table: Instance) -> int | None:
     """Return the first action before which no grasp scored over 0.7; None if there is none."""
-    return next((i for i, step in enumerate(table.film) if step["values"][0] <= outlook.SURE_SCORE), None)
+    return next((i for i, step in enumerate(table.film) if step["values"][0] <= expected_misses.SURE_SCORE), None)
 
 
 def _at(table: Instance, step: int) -> Instance:
@@ -97,13 +97,13 @@ def _at(table: Instance, step: int) -> Instance:
 
 def _shortfalls(states: Sequence[tuple[Instance, int]]) -> list[float]:
     """Return for each state how far the best grasps of all objects are from sure, summed over objects."""
-    estimate = jax.jit(outlook.misses_to_come(scorers.load_scorer(BUILTIN)))
+    estimate = jax.jit(expected_misses.misses_to_come(scorers.load_scorer(BUILTIN)))
     found = []
     for table, step in states:
         before = table.film[step]
         seen = render.render(table.scene.replace(shape=before["shape"]), before["poses"])
         seen = seen.replace(label=film.unpacked(before["label"]).astype(np.int32))
-        found.append(float(estimate(seen, before["missed"])) / outlook.MISSES_PER_SHORTFALL)
+        found.append(float(estimate(seen, before["missed"])) / expected_misses.MISSES_PER_SHORTFALL)
     return found
 
 

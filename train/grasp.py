@@ -14,7 +14,7 @@ from flax import nnx
 from dipn_jax import batching, geometry, structs
 from dipn_jax.networks import grasp, losses
 from dipn_jax.sight import fingers, render
-from dipn_jax.storage import plain
+from dipn_jax.storage import serialization
 from dipn_jax.storage.space import Space
 from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
@@ -109,7 +109,7 @@ class PretrainTask:
         return losses.score_loss(nnx.merge(graph, state)(images), labels, weight)
 
 
-@plain.register
+@serialization.register
 @flax.struct.dataclass
 class Window(Pytree):
     """One executed action as an example; the closing axis of a grasp, or a push, lies along the columns."""

@@ -22,10 +22,10 @@ from dipn_jax.storage import checkpoint, owner, saving
 from dipn_jax.system import files
 from dipn_jax.system.interruption import Interruption
 
-from . import devices, finite, log, order, precision, profiling
-from .ahead import Ahead
+from . import devices, example_order, finite, log, precision, profiling
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check
 from .optimizers import make_optimizer
+from .prefetch import Ahead
 
 BEST_MEASURE = "held_out_loss"
 """Measure that is lowest at the best step of a run."""
@@ -140,7 +140,7 @@ def fit(
         a weight is not finite, after which nothing is saved.
     """
     check(config, compute, out, data_sets=len(task.parts))
-    order.batches(task.parts, config)  # raises where the mix is wrong, before anything is made
+    example_order.batches(task.parts, config)  # raises where the mix is wrong, before anything is made
     where = devices.placement(compute, batch=config.batch)
     optimizer = make_optimizer(config, examples=task.size)
     if compute.check_only:
@@ -169,7 +169,7 @@ def _fit(
     moments, begin, best = _resume(out, model, optimizer)
     graph, *state = _split(model)
     params, rest, moments = where.everywhere((*state, moments))
-    batches = order.batches(task.parts, config)
+    batches = example_order.batches(task.parts, config)
     step_fn = make_step(task, graph, optimizer, compute=compute)
     curve = log.Log(out, begin, batch=config.batch, writes=where.leads)
     key = seeds.key(config.seed, seeds.Purpose.TRAINING)

@@ -157,7 +157,7 @@ class _Children:
             self._going.discard(process)
 
     def stop(self) -> None:
-        """Ask all processes to stop by closing their input, which `alone` watches."""
+        """Ask all processes to stop by closing their input, which `child_process` watches."""
         with self._lock:
             self.stopped = True
             for process in self._going:

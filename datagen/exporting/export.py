@@ -18,7 +18,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.storage import manifest, owner, records
 from dipn_jax.system import files, temporary
 
-from . import columns, drawn, steps
+from . import columns, rendering, steps
 from .card import card
 from .columns import Values
 from .source import Part, Source, blocks, open_source
@@ -119,9 +119,9 @@ def _write(writer: Writer, source: Source, images: str) -> None:
 def _blocks(source: Source, part: Part, images: str, progress: console.Progress) -> Iterator[Values]:
     """Return the columns of the episodes of a part, a few episodes at a time."""
     episodes, numbers, scenes = source.read(part)
-    size = drawn.block(images) if images != "none" else WITHOUT_IMAGES
+    size = rendering.block(images) if images != "none" else WITHOUT_IMAGES
     for rows in blocks(part.count, size):
         some: Any = structs.take(episodes, rows)
         values = columns.values(source.kind, some, numbers[rows], scenes[rows])
-        yield values | (drawn.draw(some, images) if images != "none" else {})
+        yield values | (rendering.draw(some, images) if images != "none" else {})
         progress.advance(int(np.size(numbers[rows])), part.name)

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from dipn_jax.system import files
 
-from . import moments, steps
+from . import feature_statistics, steps
 from .columns import PIXELS, Values
 from .source import SPLITS, Part
 
@@ -132,7 +132,7 @@ class LeRobot:
         for what in ("data", "meta/episodes"):
             found |= {f"{what}/chunk_index": folder, f"{what}/file_index": file}
         for name, value in frames.items():
-            its = moments.of_pictures(value) if name in self.pictures else moments.of(value)
+            its = feature_statistics.of_pictures(value) if name in self.pictures else feature_statistics.of(value)
             found |= {f"stats/{name}/{statistic}": numbers.tolist() for statistic, numbers in its.items()}
         return found
 
@@ -145,7 +145,7 @@ class LeRobot:
 
     def finish(self, parts: Sequence[Part]) -> None:
         """Write what describes all: statistics, the task, and `meta/info.json`."""
-        joined: dict[str, moments.Joined] = {name: moments.Joined() for name in self.features()}
+        joined: dict[str, feature_statistics.Joined] = {name: feature_statistics.Joined() for name in self.features()}
         for part in parts:
             table = pq.read_table(self._path("meta/episodes", part.place))
             for name, all_of_them in joined.items():

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.errors import UserError
-from dipn_jax.physics import blocks, kept, patches
+from dipn_jax.physics import blocks, patches, program_cache
 from dipn_jax.physics.mjx_program import Program
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
@@ -142,7 +142,7 @@ class MjxEngine:
             return out.poses, out.gripper, out.fault
 
         donate = range(first, first + len(arguments[3]))
-        call = kept.program(flat, jax.tree.leaves(arguments), what=f"mjx {self.config} highest", donate=donate)
+        call = program_cache.program(flat, jax.tree.leaves(arguments), what=f"mjx {self.config} highest", donate=donate)
 
         def run(*args: Any) -> Rollout:
             with jax.default_device(self.devices[0]):

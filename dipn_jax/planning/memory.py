@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dipn_jax import geometry
-from dipn_jax.storage import plain
+from dipn_jax.storage import serialization
 from dipn_jax.structs import Array
 from dipn_jax.workspace import WORKSPACE
 
@@ -27,7 +27,7 @@ SMOOTHED_PIXELS = 5
 """Side in pixels of the median filter that takes noise out of the two height maps before they are compared."""
 
 
-@plain.register
+@serialization.register
 @dataclasses.dataclass(frozen=True)
 class MissedGrasps:
     """Grasps that missed on one table, and what the height map around each was before it. It is never changed.

@@ -13,7 +13,7 @@ from flax import nnx
 from jaxtyping import Bool, Float
 
 from dipn_jax.names import ALL_AIDS, Aid
-from dipn_jax.networks import grasp, local, vpg
+from dipn_jax.networks import grasp, partial_scoring, vpg
 from dipn_jax.planning import planner
 from dipn_jax.planning.planner import Scorer, ScoreSummary
 from dipn_jax.storage import checkpoint
@@ -61,7 +61,7 @@ def grasp_summary(model: grasp.GraspNet, *, table: bool = True) -> ScoreSummary:
     def summarize(
         now: Float[jax.Array, "H W 4"], images: Float[jax.Array, "P H W 4"], wanted: Bool[jax.Array, " P"]
     ) -> tuple[Float[jax.Array, " Q"], Float[jax.Array, " Q"]]:
-        return local.mean_and_best(thaw(), now, images, wanted)  # type: ignore[arg-type]
+        return partial_scoring.mean_and_best(thaw(), now, images, wanted)  # type: ignore[arg-type]
 
     return summarize
 

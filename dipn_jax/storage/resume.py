@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from dipn_jax.commands import console
-from dipn_jax.storage import checkpoint, plain
+from dipn_jax.storage import checkpoint, serialization
 from dipn_jax.system import files
 
 FORMAT_VERSION = 1
@@ -51,7 +51,7 @@ class Partial:
     def load(self, fresh: Any) -> Any:
         """Return the state kept, or `fresh` if there is none for these settings, with a line if it cannot be used."""
         try:
-            kept = plain.loads(files.read_bytes(self.path))
+            kept = serialization.loads(files.read_bytes(self.path))
             identity, code, state = kept["identity"], kept["code"], kept["state"]
         except FileNotFoundError:
             return fresh
@@ -67,8 +67,10 @@ class Partial:
         return state
 
     def save(self, state: Any) -> None:
-        """Keep `state` (what `plain.dumps` takes), atomically."""
-        files.write_atomically(self.path, plain.dumps({"identity": self.identity, "code": self.code, "state": state}))
+        """Keep `state` (what `serialization.dumps` takes), atomically."""
+        files.write_atomically(
+            self.path, serialization.dumps({"identity": self.identity, "code": self.code, "state": state})
+        )
 
     def finish(self) -> None:
         """Delete the kept state, and the `.pickle` of earlier versions, once results are written."""

@@ -12,7 +12,7 @@ from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.planning.memory import MissedGrasps
-from dipn_jax.storage import plain
+from dipn_jax.storage import serialization
 from dipn_jax.structs import Fault, Scene
 from dipn_jax.world import cases as case_files
 from dipn_jax.world import clutter, primitives, scenes
@@ -25,7 +25,7 @@ FRICTION_FACTOR = (0.85, 1.15)
 """Range of the factor on the friction of each object of a repeated case."""
 
 
-@plain.register
+@serialization.register
 @dataclasses.dataclass
 class Instance:
     """One table being cleared."""

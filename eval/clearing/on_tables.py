@@ -12,7 +12,7 @@ from dipn_jax import batching
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.planning import methods
-from dipn_jax.planning.acts import DecideFunction
+from dipn_jax.planning.deciding import DecideFunction
 from dipn_jax.planning.methods import Networks, Policy
 from dipn_jax.planning.planner import Rule
 from dipn_jax.planning.policy_config import PolicyConfig

@@ -58,7 +58,7 @@ for words in json.loads(sys.argv[1]):
     lines = [{"step": 3, "loss": 1.0}, {"step": 6, "loss": limit / 8}]
     (out / "metrics.jsonl").write_text("\\n".join(map(json.dumps, lines)))
 """
-"""Stands in for `alone`: first, training on 13 episodes is killed, on 14 has a mistake, on 15 waits to be stopped."""
+"""For `child_process`: first, training on 13 episodes is killed, on 14 has a mistake, on 15 waits to be stopped."""
 
 
 @pytest.fixture

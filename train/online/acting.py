@@ -17,7 +17,7 @@ from dipn_jax.networks.vpg import VPG
 from dipn_jax.planning import candidates, memory, scorers
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.sight import fingers, render
-from dipn_jax.storage import plain
+from dipn_jax.storage import serialization
 from dipn_jax.structs import Array, Fault, Grasp, Push, Pytree, Scene
 from dipn_jax.world import clutter, primitives
 
@@ -48,7 +48,7 @@ UNCOVERED_REWARD = 0.8
 """DQN+GN: least reward of a push that spreads objects out. Source: DIPN's code."""
 
 
-@plain.register
+@serialization.register
 @flax.struct.dataclass
 class Look(Pytree):
     """A table as a learner sees it, and the actions that it may choose."""

@@ -24,7 +24,7 @@ from dipn_jax.networks import losses
 from dipn_jax.networks.vpg import VPG, VpgConfig
 from dipn_jax.planning.planner import Scorer
 from dipn_jax.seeds import Purpose
-from dipn_jax.storage import checkpoint, plain
+from dipn_jax.storage import checkpoint, serialization
 from dipn_jax.structs import Grasp, GraspEpisode
 from dipn_jax.system import files
 from dipn_jax.world.scenes import SceneConfig
@@ -48,7 +48,7 @@ RECENT_ACTIONS = 100
 """The number of last actions over which rewards are averaged."""
 
 
-@plain.register
+@serialization.register
 @dataclasses.dataclass
 class State:
     """Everything that an interrupted run needs to continue."""

@@ -20,7 +20,7 @@ from dipn_jax.networks.grasp import GraspNet, score_image
 from dipn_jax.planning import candidates
 from dipn_jax.seeds import Purpose
 from dipn_jax.sight import render
-from dipn_jax.storage import checkpoint, plain
+from dipn_jax.storage import checkpoint, serialization
 from dipn_jax.structs import Fault, Grasp, GraspEpisode, Scene
 from dipn_jax.system import files
 from dipn_jax.world import clutter
@@ -39,7 +39,7 @@ RECENT_GRASPS = 50
 """The number of last grasps over which success is counted."""
 
 
-@plain.register
+@serialization.register
 @dataclasses.dataclass
 class State:
     """Everything that an interrupted run needs to continue."""

@@ -17,7 +17,7 @@ from dipn_jax.system import files
 
 
 class State(Protocol):
-    """State of a run after some rounds: a dataclass that `plain` has registered."""
+    """State of a run after some rounds: a dataclass that `serialization` has registered."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     round: int

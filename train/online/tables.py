@@ -11,7 +11,7 @@ import numpy as np
 from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
 from dipn_jax.seeds import Purpose
-from dipn_jax.storage import plain
+from dipn_jax.storage import serialization
 from dipn_jax.structs import Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import clutter
@@ -21,7 +21,7 @@ IDLE_LIMIT = 3
 """Actions without effect in a row after which a table is replaced."""
 
 
-@plain.register
+@serialization.register
 @dataclasses.dataclass
 class Tables:
     """T tables, with everything about them that an interrupted run has to keep."""

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from dipn_jax.datagen import cli
-from dipn_jax.datagen.exporting import columns, drawn, export, source
+from dipn_jax.datagen.exporting import columns, export, rendering, source
 from dipn_jax.train.split import split
 
 from dipn_jax.commands import console
@@ -99,7 +99,7 @@ def test_a_part_is_written_whole_or_not_at_all(
     data: Data, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pictures are drawn block by block; it ends in the second of the first part."""
-    draw, drawn_so_far = drawn.draw, list[int]()
+    draw, drawn_so_far = rendering.draw, list[int]()
 
     def stop(episodes: Any, images: str) -> columns.Values:
         drawn_so_far.append(len(episodes.fault))
@@ -107,7 +107,7 @@ def test_a_part_is_written_whole_or_not_at_all(
             raise KeyboardInterrupt
         return draw(episodes, images)
 
-    monkeypatch.setattr(drawn, "draw", stop)
+    monkeypatch.setattr(rendering, "draw", stop)
     for form in ("parquet", "npz"):
         drawn_so_far.clear()
         out = tmp_path / form
@@ -166,7 +166,7 @@ def test_every_column_has_the_type_and_the_shape_that_it_is_said_to_have(data: D
         found = source.open_source(data[kind])
         episodes, numbers, scenes = found.read(found.parts()[-1])
         some = episodes[:1]
-        values = columns.values(kind, some, numbers[:1], scenes[:1]) | drawn.draw(some, images)
+        values = columns.values(kind, some, numbers[:1], scenes[:1]) | rendering.draw(some, images)
         wanted = columns.of_episodes(kind, images)
         assert list(values) == [column.name for column in wanted]
         for column in wanted:
@@ -184,7 +184,7 @@ def test_pictures_are_what_the_camera_sees(data: Data) -> None:
         ("both", "after", after),
         ("before", "before", before),
     ):
-        values = drawn.draw(some, images)
+        values = rendering.draw(some, images)
         seen = render.observe(some.scene, poses)
         at = (slice(None), 10) if images == "all" else ()
         np.testing.assert_array_equal(values[f"height_{moment}"][at], seen.height)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from dipn_jax.eval.clearing.instances import Instance
 
-from dipn_jax.storage import plain
+from dipn_jax.storage import serialization
 from dipn_jax.storage.resume import Partial
 from dipn_jax.structs import Scene
 from dipn_jax.system import files
@@ -77,4 +77,4 @@ def test_a_state_of_other_sources_or_a_damaged_one_is_named_and_not_taken_up(
 def test_what_is_not_registered_is_refused() -> None:
     for value in (object(), np.array([None]), {"x": {1}}):
         with pytest.raises(TypeError, match="cannot keep"):
-            plain.dumps(value)
+            serialization.dumps(value)

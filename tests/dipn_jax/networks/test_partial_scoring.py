@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dipn_jax import structs
-from dipn_jax.networks import local
+from dipn_jax.networks import partial_scoring
 from dipn_jax.planning import planner, predictors, scorers
 from dipn_jax.sight import render
 from dipn_jax.storage import checkpoint
@@ -42,11 +42,11 @@ def test_finalists_have_the_values_of_whole_images_and_the_same_one_wins(settled
     for i in range(6):
         table = structs.take(seen, i)
         plain, fast = (jax.device_get(scores["decide"](table, quick)) for quick in (False, True))
-        many += plain.candidates.feasible.sum() > local.SCORED_WHOLE
+        many += plain.candidates.feasible.sum() > partial_scoring.SCORED_WHOLE
         np.testing.assert_array_equal(plain.candidates.feasible, fast.candidates.feasible)
         assert plain.best == fast.best and plain.is_push == fast.is_push
         equal = np.isclose(plain.values, fast.values, rtol=1e-4) & plain.candidates.feasible
-        assert equal.sum() >= min(local.FINALISTS, plain.candidates.feasible.sum())
+        assert equal.sum() >= min(partial_scoring.FINALISTS, plain.candidates.feasible.sum())
     assert many, "every image was scored whole"
 
 
@@ -60,12 +60,12 @@ def test_rough_means_rank_nearly_as_whole_images_do(settled: Any, scores: dict[s
         others[k, 20 + 20 * k : 45 + 20 * k, 30:80] = [0.5, 0.2, 0.2, 0.04]
     whole, _ = planner.summarize_whole(scorers.plain_scorer(scores["gn"]))(now, others, np.ones(8, bool))
     whole = whole[1:]
-    before = jax.jit(lambda image: local.scores_now(scores["gn"], image))(now)
+    before = jax.jit(lambda image: partial_scoring.scores_now(scores["gn"], image))(now)
 
     def roughly(images: Any) -> Any:
         every = np.ones(8, bool)
-        look = lambda turns: local.rough_means(scores["gn"], now, before, images, every, turns=turns)  # noqa: E731
-        return np.asarray(jax.jit(lambda: jnp.stack([look(turns) for turns in local.LOOK_TURNS]))())
+        look = lambda turns: partial_scoring.rough_means(scores["gn"], now, before, images, every, turns=turns)  # noqa: E731
+        return np.asarray(jax.jit(lambda: jnp.stack([look(turns) for turns in partial_scoring.LOOK_TURNS]))())
 
     rough = roughly(others)
     change = np.asarray(whole) - np.asarray(whole).min()

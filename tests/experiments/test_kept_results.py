@@ -8,8 +8,8 @@ from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import lockstep
 
 from dipn_jax.system import files
-from experiments import clearing_tables, kept, runs
-from experiments.kept import Kept
+from experiments import clearing_tables, kept_results, runs
+from experiments.kept_results import Kept
 from experiments.runs import Recipe, Run
 
 ENTRY = {"name": "01", "ended": "cleared", "objects": 5, "removed": 5, "held": 4, "grasps": 5, "pushes": 1}
@@ -51,7 +51,7 @@ def test_only_what_is_missing_is_carried_out_and_what_that_needs(tmp_path: pathl
     results = Kept(tmp_path / "kept.json")
 
     def left(*only: str) -> list[str]:
-        return [run.name for run in kept.missing(listed, only, found, results)]
+        return [run.name for run in kept_results.missing(listed, only, found, results)]
 
     assert left() == ["net", "one", "two", "three"]
     results.found |= {name: {"key": found[name]} for name in ("one", "three")}

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax.physics import kept
+from dipn_jax.physics import program_cache
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def test_a_program_is_traced_once_unless_anything_differs_or_its_file_is_damaged
             traced.append(what)
             return jnp.linalg.cholesky(x @ x.T + jnp.eye(rows)), y + 1
 
-        call = kept.program(function, [np.ones((rows, 2), np.float32), np.zeros(4)], what=what, donate=[1])
+        call = program_cache.program(function, [np.ones((rows, 2), np.float32), np.zeros(4)], what=what, donate=[1])
         found, more = call(np.ones((rows, 2), np.float32), np.zeros(4, np.float32))
         wanted = np.linalg.cholesky(np.full((rows, rows), 2) + np.eye(rows))
         np.testing.assert_allclose(found, wanted, atol=1e-5)
@@ -49,12 +49,12 @@ def test_a_program_is_traced_once_unless_anything_differs_or_its_file_is_damaged
 
 def test_a_folder_that_cannot_be_written_keeps_nothing_and_breaks_nothing(cache: pathlib.Path) -> None:
     cache.write_text("a file in the folder's place")
-    (found,) = kept.program(lambda x: (x + 1,), [np.zeros(2)], what="", donate=())(np.zeros(2))
+    (found,) = program_cache.program(lambda x: (x + 1,), [np.zeros(2)], what="", donate=())(np.zeros(2))
     assert found.tolist() == [1, 1]
 
 
 def test_without_a_cache_nothing_is_kept(cache: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(cache.parent)
     jax.config.update("jax_compilation_cache_dir", None)
-    (found,) = kept.program(lambda x: (x + 1,), [np.zeros(2)], what="", donate=())(np.zeros(2))
+    (found,) = program_cache.program(lambda x: (x + 1,), [np.zeros(2)], what="", donate=())(np.zeros(2))
     assert found.tolist() == [1, 1] and not list(cache.parent.iterdir())

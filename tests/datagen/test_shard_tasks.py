@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from dipn_jax.datagen import cli, generate, spread
+from dipn_jax.datagen import cli, generate, shard_tasks
 from dipn_jax.datagen.generate import Job
 
 from dipn_jax.commands import console, launch
@@ -49,18 +49,18 @@ def test_tasks_make_the_data_set_of_one_machine(
 
     monkeypatch.setattr(launch, "run", run)
     out = tmp_path / "out"
-    generate.generate(JOB, out, elsewhere=spread.elsewhere(Launch("ray"), threads=None, network=None))
+    generate.generate(JOB, out, elsewhere=shard_tasks.elsewhere(Launch("ray"), threads=None, network=None))
     assert _bytes(out) == _bytes(alone)
 
 
 def test_a_task_refuses_what_it_cannot_make(tmp_path: pathlib.Path) -> None:
     with pytest.raises(UserError, match="a task does not see it; give an --out that all machines"):
-        spread.make_shard(JOB, JOB.describe(), 0, tmp_path / "nowhere", 1, None)
+        shard_tasks.make_shard(JOB, JOB.describe(), 0, tmp_path / "nowhere", 1, None)
     job = dataclasses.replace(JOB, engine="mjx")
     with pytest.raises(UserError, match="begun with cuda, a task has cpu"):
-        spread.make_shard(job, job.describe() | {"device": "cuda"}, 0, tmp_path, 1, None)
+        shard_tasks.make_shard(job, job.describe() | {"device": "cuda"}, 0, tmp_path, 1, None)
     with pytest.raises(UserError, match="a task finds other weights there"):
-        spread._scorer(pathlib.Path("builtin"), "0")
+        shard_tasks._scorer(pathlib.Path("builtin"), "0")
 
 
 def test_a_cluster_makes_all_shards_and_no_worker_has_a_number(capfd: pytest.CaptureFixture[str]) -> None:

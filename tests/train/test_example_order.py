@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from dipn_jax.train import order
+from dipn_jax.train import example_order
 from dipn_jax.train.configs import TrainConfig
 from dipn_jax.train.split import within
 
@@ -14,7 +14,7 @@ CONFIG = TrainConfig(batch=4)
 
 
 def _seen(parts: tuple[int, ...], config: TrainConfig, steps: int) -> np.ndarray:
-    batches = order.batches(parts, config)
+    batches = example_order.batches(parts, config)
     return np.concatenate([np.asarray(batches[step]) for step in range(steps)])
 
 
@@ -33,7 +33,7 @@ def test_a_mix_takes_its_share_from_each_data_set_and_all_of_both() -> None:
     assert all((some >= 10).sum() == 3 for some in np.split(seen, 40))
     np.testing.assert_array_equal(np.bincount(seen[seen < 10]), np.full(10, 4))
     np.testing.assert_array_equal(np.bincount(seen[seen >= 10])[10:], np.full(6, 20))
-    np.testing.assert_array_equal(order.batches((10, 6), mixed)[7], seen[28:32])
+    np.testing.assert_array_equal(example_order.batches((10, 6), mixed)[7], seen[28:32])
 
 
 def test_the_first_examples_are_of_the_first_data_sets() -> None:
@@ -51,4 +51,4 @@ def test_the_first_examples_are_of_the_first_data_sets() -> None:
 )
 def test_a_mix_that_makes_no_sense_is_refused(parts: tuple[int, ...], mix: tuple[float, ...], says: str) -> None:
     with pytest.raises(UserError, match=says):
-        order.batches(parts, dataclasses.replace(CONFIG, mix=mix))
+        example_order.batches(parts, dataclasses.replace(CONFIG, mix=mix))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dipn_jax.planning import candidates, outlook, planner, predictors
+from dipn_jax.planning import candidates, expected_misses, planner, predictors
 from dipn_jax.sight import masks
 from dipn_jax.structs import ABSENT, Observation, Push
 
@@ -44,24 +44,28 @@ def test_every_object_in_sight_counts_by_what_its_best_grasp_lacks(row: Observat
     for slot, (rotation, score) in enumerate(((0, 0.7), (3, 0.35), (15, 0.0), (8, 0.95))):
         scores[rotation][row.label == slot] = score / 2
         scores[rotation, 105, 85 + 13 * slot] = score
-    estimate = outlook.misses_to_come(lambda images: jnp.asarray(scores)[None])
+    estimate = expected_misses.misses_to_come(lambda images: jnp.asarray(scores)[None])
     short = 0 + 0.5 + 1 + 0
-    assert float(estimate(row, planner.NONE_MISSED)) == pytest.approx(outlook.MISSES_PER_SHORTFALL * short, rel=1e-5)
+    assert float(estimate(row, planner.NONE_MISSED)) == pytest.approx(
+        expected_misses.MISSES_PER_SHORTFALL * short, rel=1e-5
+    )
     missed = np.array([[8, 105, 85 + 39]], np.int32)  # the fourth object's grasps now score 0.475 at most
     near = candidates.discount_missed(jnp.asarray(scores), missed)[:, row.label == 3].max()
     assert near == pytest.approx(0.475)
     more = 1 - 0.475 / 0.7
-    assert float(estimate(row, missed)) == pytest.approx(outlook.MISSES_PER_SHORTFALL * (short + more), rel=1e-5)
+    assert float(estimate(row, missed)) == pytest.approx(
+        expected_misses.MISSES_PER_SHORTFALL * (short + more), rel=1e-5
+    )
 
 
 def _decide(seen: Observation, predictor: Any, scorer: Any, missed: Any = planner.NONE_MISSED) -> Any:
-    rule, estimate, key = planner.Rule(grasp_above=0.7), outlook.misses_to_come(scorer), jax.random.key(0)
+    rule, estimate, key = planner.Rule(grasp_above=0.7), expected_misses.misses_to_come(scorer), jax.random.key(0)
     return planner.decide(key, seen, predictor, scorer, count=COUNT, rule=rule, missed=missed, estimate=estimate)
 
 
 def test_a_push_is_made_where_it_saves_more_than_itself(row: Observation) -> None:
     decision = _decide(row, spread, apart)
-    four = 4 * (1 - 0.14 / 0.7) * outlook.MISSES_PER_SHORTFALL
+    four = 4 * (1 - 0.14 / 0.7) * expected_misses.MISSES_PER_SHORTFALL
     assert decision.value_now == pytest.approx(-four, rel=1e-5) and four > 1
     assert decision.value_push == pytest.approx(-1.0) and decision.is_push
     still = _decide(row, predictors.static_predictor, apart)

@@ -3,7 +3,7 @@
 import threading
 
 import pytest
-from dipn_jax.train.ahead import Ahead
+from dipn_jax.train.prefetch import Ahead
 
 
 def test_batches_come_in_order_and_the_next_is_made_meanwhile() -> None:
