@@ -9,7 +9,7 @@ import pytest
 
 from dipn_jax.errors import UserError
 from dipn_jax.system import files
-from experiments import clearing, clearing_tables, demo, grasping, pages, push_prediction, runs
+from experiments import clearing, clearing_tables, demo, grasping, mjx_elliptic_cone, pages, push_prediction, runs
 
 DOCS = pathlib.Path(__file__).parent.parent.parent / "docs"
 PAGES = {"push-prediction": push_prediction, "grasping": grasping, "clearing": clearing, "demo": demo}
@@ -20,7 +20,7 @@ def _figures(name: str) -> dict[str, Any]:
     return {key: value for key, value in files.read_json(DOCS / f"{name}.json").items() if key != pages.MADE}
 
 
-@pytest.mark.parametrize("name", [*PAGES, "world"])
+@pytest.mark.parametrize("name", [*PAGES, "world", "mjx-elliptic-cone"])
 def test_the_boxes_in_docs_are_those_of_the_kept_facts(name: str) -> None:
     text, values = (DOCS / f"{name}.md").read_text(), files.read_json(DOCS / f"{name}.json")
     assert values[pages.MADE] and all(
@@ -42,6 +42,13 @@ def test_the_pages_in_docs_show_the_figures_in_docs(name: str) -> None:
         tables = page.tables(values)
     for table in tables:
         assert table in text and pages.with_table(text, table) == text
+
+
+def test_the_elliptic_cones_page_shows_its_figures() -> None:
+    values = files.read_json(DOCS / "mjx-elliptic-cone.json")
+    table = mjx_elliptic_cone.table(values)
+    assert table in (DOCS / "mjx-elliptic-cone.md").read_text()
+    assert values["MuJoCo C/not_a_number"] == 0 and len(table.splitlines()) == 5
 
 
 FACTS = {
