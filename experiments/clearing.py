@@ -59,8 +59,11 @@ CHANGED = {
     "rough": "--cases random --objects 10 --instances 30 --friction 0.6 0.9",
     "large": "--cases random --objects 10 --instances 30 --scale 1.1 1.2",
     "packed": "--cases random --objects 8 --instances 30 --packed 1",
+    "arches": "--cases random --objects 10 --instances 30 --items concave concave_slim",
 }
-"""Tables on which physics or sizes are others than in training, and packed rows."""
+"""Tables on which physics or sizes are other than in training; packed rows; and tables with nothing but arches."""
+COMPARED = ("dipn+gn", "gn", "dqn+gn")
+"""Methods that clear these tables, with networks of the budget `paper`."""
 
 
 def list_runs(root: pathlib.Path) -> list[Run]:
@@ -80,6 +83,9 @@ def list_runs(root: pathlib.Path) -> list[Run]:
                         label = f"--label {budget}-{aids}-{seed}"
                         name = f"table/{on}/{budget}/{aids}/{method}/{seed}"
                         run(name, "dipn-eval clear", which, label, extra, *options)
+            if (budget, seed) == ("paper", 0):
+                _changed(run, budget, methods, CHANGED)
+    _changed(run, "unseen", _train_without_arches(run, pushes), {"arches": CHANGED["arches"]})
     run("sweep", f"dipn-eval sweep {BUILTIN} --distances 0.03:0.12:0.01 --instances 3")
     return run.runs
 
@@ -108,6 +114,31 @@ def _train(
         "dqn+gn": ("--method dqn+gn --value-net", dqn, "--grasp-net", gn),
         "vpg": ("--method vpg --value-net", vpg),
     }
+
+
+def _train_without_arches(run: Recipe, pushes: pathlib.Path) -> dict[str, tuple[Part, ...]]:
+    """Add a training of each network of COMPARED that never sees an arch; return the options of these methods."""
+    others = f"--items {grasping.NO_ARCHES}"
+    images = run("unseen/images", "dipn-datagen images --episodes 100", others)
+    pretrained = run("unseen/pretrained", "dipn-train grasp-pretrain --steps 400 --data", images)
+    gn = run("unseen/gn", f"dipn-train grasp-online --grasps {PAPER['gn']}", others, "--init", pretrained)
+    learnt = f"dipn-train push --steps 3000 --limit {PAPER['dipn']} --without concave --data"
+    dipn = run("unseen/dipn", learnt, pushes)
+    act = f"dipn-train baseline --method dqn --actions {PAPER['dqn']}"
+    dqn = run("unseen/dqn", act, others, "--grasp-net", gn)
+    return {
+        "dipn+gn": ("--push-net", dipn, "--grasp-net", gn),
+        "gn": ("--method gn --grasp-net", gn),
+        "dqn+gn": ("--method dqn+gn --value-net", dqn, "--grasp-net", gn),
+    }
+
+
+def _changed(run: Recipe, networks: str, methods: dict[str, tuple[Part, ...]], worlds: dict[str, str]) -> None:
+    """Add the evaluations of COMPARED on changed worlds; `networks` names what they decide with."""
+    for name, which in worlds.items():
+        for method in COMPARED:
+            label = f"--label {name}-{networks}"
+            run(f"changed/{name}/{networks}/{method}", "dipn-eval clear", which, label, *methods[method])
 
 
 def _shipped(run: Recipe) -> None:

@@ -216,7 +216,7 @@ def section(values: dict[str, Any]) -> str:
             base,
             aids,
         ),
-        ("Changed worlds", "random tables", {}, _named(values, "changed")),
+        ("Changed worlds", "random tables", {}, _worlds(values)),
         ("A distance for every push", "push, DIPN+GN on held-out tables", base, distance),
     )
     for title, head, first, rows in others:
@@ -229,6 +229,20 @@ def _named(values: dict[str, Any], kind: str) -> dict[str, str]:
     """Return the groups of a kind, title by name."""
     found = [key.rpartition("/")[0] for key in values if key.startswith(f"{kind}/") and key.endswith("/tables")]
     return {group: ", ".join(group.split("/")[1:]) for group in found}
+
+
+NETWORKS = {"": "shipped", "paper": "paper", "unseen": "paper, trained without arches"}
+"""Networks of the table of changed worlds by the part of a run's name, and their titles."""
+
+
+def _worlds(values: dict[str, Any]) -> dict[str, str]:
+    """Return the groups of changed worlds, title by name, world after world."""
+    titles = {}
+    for at in _named(values, "changed"):
+        _, world, *networks, method = at.split("/")
+        titles[at] = f"{world}: {method}, {NETWORKS[''.join(networks)]}"
+    worlds = list(dict.fromkeys(at.split("/")[1] for at in titles))
+    return dict(sorted(titles.items(), key=lambda pair: worlds.index(pair[0].split("/")[1])))
 
 
 def swept(values: dict[str, Any]) -> str:

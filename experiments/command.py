@@ -74,7 +74,11 @@ def _parser(module: str, description: str, folder: str, page_on_request: bool) -
     parser.add_argument("--list", action="store_true", help="show the names of the runs and their commands")
     parser.add_argument("--dry-run", action="store_true", help="check every command and say what is left to do")
     parser.add_argument(
-        "--only", nargs="+", default=[], metavar="NAME", help="these runs and those that they need; no page is written"
+        "--only",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="these runs (`a` stands for all called a/...) and those that they need; no page is written",
     )
     parser.add_argument(
         "--out", type=pathlib.Path, default=pathlib.Path(folder), metavar="FOLDER", help=f"of results ({folder})"

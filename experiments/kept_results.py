@@ -68,12 +68,13 @@ def missing(listed: Sequence[Run], only: Sequence[str], found: dict[str, str], k
 
     Args:
       listed: all runs.
-      only: names of those wanted, all if there are none.
+      only: names of those wanted, as `runs.named` takes them; all if there are none.
       found: `runs.keys` of all.
       kept: the results that there are.
     """
     read = {other.name for run in listed for other in runs.needs(run, listed)}
-    ends = [run.name for run in runs.select(listed, only) if run.name not in read or run.name in only]
+    asked = runs.named(listed, only)
+    ends = [run.name for run in runs.select(listed, asked) if run.name not in read or run.name in asked]
     left = [name for name in ends if not kept.has(next(run for run in listed if run.name == name), found[name])]
     return runs.select(listed, left) if left else []
 

@@ -116,16 +116,33 @@ def keys(listed: Sequence[Run]) -> dict[str, str]:
     return found
 
 
+def named(listed: Sequence[Run], only: Sequence[str]) -> list[str]:
+    """Return the names of the runs that `only` names; `changed` stands for all runs called `changed/...`.
+
+    Raises:
+      UserError: no run is called so.
+    """
+    found: list[str] = []
+    for wanted in only:
+        few = [run.name for run in listed if run.name == wanted or run.name.startswith(f"{wanted}/")]
+        if not few:
+            raise UserError(f"--only {wanted}: no such run; --list shows their names")
+        found += few
+    return found
+
+
 def select(listed: Sequence[Run], only: Sequence[str]) -> list[Run]:
     """Return the runs called `only`, and before them those that they need; all where `only` is empty.
+
+    Args:
+      listed: all runs.
+      only: names, as `named` takes them.
 
     Raises:
       UserError: one of the names is none.
     """
     names = {run.name: run for run in listed}
-    if unknown := [name for name in only if name not in names]:
-        raise UserError(f"--only {unknown[0]}: no such run; --list shows their names")
-    wanted, waiting = set[str](), list(only or names)
+    wanted, waiting = set[str](), named(listed, only) or list(names)
     while waiting:
         name = waiting.pop()
         if name not in wanted:

@@ -110,6 +110,28 @@ def test_a_difference_that_may_be_nothing_is_not_bold(tmp_path: pathlib.Path) ->
     assert "+0.0 [" in text and "**" not in text and "| gn, paper (1 training) |" in text
 
 
+def test_changed_worlds_are_compared_with_the_same_networks_in_the_same_world(tmp_path: pathlib.Path) -> None:
+    rows = {
+        "changed/heavy/dipn+gn": [5, 5, 5, 5],
+        "changed/heavy/gn": [10, 10, 10, 10],
+        "changed/arches/dipn+gn": [5, 5, 5, 5],
+        "changed/heavy/paper/dipn+gn": [20, 20, 20, 20],
+        "changed/heavy/paper/dqn+gn": [10, 10, 10, 10],
+    }
+    values = clearing_tables.numbers(*_kept(tmp_path, rows))
+    text = clearing_tables.section(values)
+    assert values["changed/heavy/gn/efficiency_all_less"] == 0.5 - 1
+    assert values["changed/heavy/paper/dqn+gn/efficiency_all_less"] == 0.5 - 0.25
+    titles = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| ")]
+    assert titles[2:] == [
+        "heavy: dipn+gn, shipped",
+        "heavy: gn, shipped",
+        "heavy: dipn+gn, paper",
+        "heavy: dqn+gn, paper",
+        "arches: dipn+gn, shipped",
+    ]
+
+
 def test_hindsight_chooses_the_better_table_by_table(tmp_path: pathlib.Path) -> None:
     rows = {
         "table/hard/shipped/all/dipn+gn/0": [5, 5, 5, 5],

@@ -78,6 +78,8 @@ def test_a_selected_run_includes_the_runs_that_it_needs(fake, tmp_path: pathlib.
     assert [run.name for run in runs.select(listed, ["c"])] == ["a", "b", "c"]
     assert [run.name for run in runs.select(listed, ["d", "a"])] == ["a", "d"]
     assert runs.select(listed, []) == listed
+    under = [dataclasses.replace(run, name=f"{'x' if i < 2 else 'xy'}/{run.name}") for i, run in enumerate(listed)]
+    assert runs.named(under, ["x", "xy/d"]) == ["x/a", "x/b", "xy/d"]
     with pytest.raises(UserError, match="--only e: no such run"):
         runs.select(listed, ["a", "e"])
 
