@@ -167,7 +167,7 @@ class _Children:
 
 def _program(commands: Sequence[Sequence[str]]) -> list[str]:
     """Return the command line of a process that carries out commands of `dipn-train`, one after another."""
-    return [sys.executable, "-m", f"{__package__}.alone", json.dumps(commands)]
+    return [sys.executable, "-m", f"{__package__}.child_process", json.dumps(commands)]
 
 
 def _call(commands: Sequence[Sequence[str]], title: str, children: _Children) -> tuple[int, str]:
