@@ -122,7 +122,7 @@ def our_depth(seed: int, count: int) -> float:
     return float(np.quantile(np.concatenate(depths), DEPTH_QUANTILE))
 
 
-def like(pool: Pool, seed: int, count: int, limit: float) -> tuple[Settings, float]:
+def settings_as_accurate(pool: Pool, seed: int, count: int, limit: float) -> tuple[Settings, float]:
     """Return the cheapest settings of the ladder that sink at most `limit` metres (else the last), and how deep."""
     depth = np.inf
     for settings in LADDER:
@@ -156,7 +156,7 @@ def vs_pybullet(setting: Setting) -> Iterator[tuple[str, float]]:
     make_data(job)  # compiles
     with multiprocessing.get_context("spawn").Pool(cores()) as pool:
         pool.map(bullet_worker.ready, range(cores()), chunksize=1)
-        settings, theirs_depth = like(pool, setting.seed + 1, 8 * cores(), MAX_DEPTH_RATIO * depth)
+        settings, theirs_depth = settings_as_accurate(pool, setting.seed + 1, 8 * cores(), MAX_DEPTH_RATIO * depth)
         for name, chosen in (("", settings), ("/same_step", SAME_STEP)):
             work = works(setting.seed, count, chosen)
             theirs = functools.partial(pool.map, bullet_worker.episodes, work, chunksize=1)

@@ -64,7 +64,7 @@ def plain_mjcf(scene: Scene, config: PhysicsConfig) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-class Naive:
+class PlainLoop:
     """The loop to compare with: `jax.vmap(mjx.step)`, jitted, called in Python, with no limit on contacts."""
 
     def __init__(self, scene: Scene, poses: np.ndarray, config: PhysicsConfig) -> None:
@@ -114,7 +114,7 @@ def vs_naive(setting: Setting) -> Iterator[tuple[str, float]]:
         work = ours(scene, poses, duration)
         work()  # compiles
         with jax.numpy_rank_promotion("allow"):
-            naive = Naive(scene, poses, config)
+            naive = PlainLoop(scene, poses, config)
             mine, theirs = alternate(work, functools.partial(naive.run, steps), repeats=setting.pick(3, 5))
         if not np.isfinite(np.asarray(naive.last.qpos)).all():
             raise RuntimeError("the naive loop diverged: its time means nothing; try another --seed")

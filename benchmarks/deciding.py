@@ -58,7 +58,7 @@ def _seen(objects: str, count: int, seed: int, *, packed: float = 0.0) -> Observ
 def _decider(preset: str, count: int, *, fast: bool) -> Callable[[Observation, int], Decision]:
     dipn, gn = _networks(preset)
     predictor, scorer = predictors.dipn_predictor(dipn), scorers.aided_scorer(gn)
-    summarize = scorers.grasp_summary(gn) if fast else planner.summarize_whole(scorers.plain_scorer(gn))
+    summarize = scorers.grasp_summary(gn) if fast else planner.summarize_whole(scorers.unaided_scorer(gn))
 
     def decide(seen: Observation, key: int) -> Decision:
         random = jax.random.key(key)
@@ -145,7 +145,7 @@ def _paper_whole(seen: Observation, count: int) -> float:
     """Measure seconds per image of the published networks, all rotations of it in one call."""
     dipn, gn = _networks("paper")
     image_after = _imagined(seen, count, predictors.dipn_predictor(dipn))
-    mean = jax.jit(lambda image: scorers.plain_scorer(gn)(image[None]).mean())
+    mean = jax.jit(lambda image: scorers.unaided_scorer(gn)(image[None]).mean())
 
     def work() -> None:
         for i in range(count):

@@ -33,7 +33,7 @@ def jax_step(preset: str, work: str, arrays: dict[str, np.ndarray], precision: s
     if work == "score":
         model.eval()
         parameters = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(model, nnx.Param)))
-        scorer, image = jax.jit(scorers.plain_scorer(model)), jnp.asarray(arrays["image"])[None]
+        scorer, image = jax.jit(scorers.unaided_scorer(model)), jnp.asarray(arrays["image"])[None]
         return lambda: scorer(image).block_until_ready(), parameters
     images, pixel, success = (jnp.asarray(arrays[name]) for name in ("images", "pixel", "success"))
 

@@ -159,7 +159,7 @@ def _page(folder: pathlib.Path, about: dict[str, Any], counts: Counts, figures: 
     ]
     tables = "".join(pages.bars(name, dict(sorted(some.items()))) for name, some in counts.items())
     parts = [
-        f"<h1>{pages.escaped(title)}</h1><p>{pages.escaped(addresses.named(str(folder)))}</p>",
+        f"<h1>{pages.escaped(title)}</h1><p>{pages.escaped(addresses.with_urls(str(folder)))}</p>",
         *[f'<p class="note">{pages.escaped(said)}</p>' for said in _remarks(about)],
         f"<h2>Counts</h2>{pages.table(['', ''], facts)}<h2>What was drawn</h2>{tables}",
         f"<h2>Episodes</h2><p>{_selects(counts)}<span id=shown>{len(figures)}</span> of {len(figures)} shown, drawn at "
@@ -168,7 +168,7 @@ def _page(folder: pathlib.Path, about: dict[str, Any], counts: Counts, figures: 
         "<h2>How it was made</h2>",
         *_made(folder, about),
     ]
-    return pages.alone(title, "".join(parts), style=_STYLE, script=_SCRIPT)
+    return pages.standalone_page(title, "".join(parts), style=_STYLE, script=_SCRIPT)
 
 
 def _remarks(about: dict[str, Any]) -> Iterator[str]:

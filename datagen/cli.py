@@ -46,7 +46,7 @@ class Work:
     """Where the shards are made."""
 
     def __post_init__(self) -> None:
-        if self.launch.spreads and self.of > 1:
+        if self.launch.uses_cluster and self.of > 1:
             raise UserError("--launcher ray makes all shards: leave out --shard and --of")
 
 
@@ -61,7 +61,7 @@ def _generate(job: Job, out: pathlib.Path, work: Work, given: dict[str, Any], *,
     work.launch.begin()
     command = command_line.words(COMMANDS[job.kind], given, without=command_line.WORKER_OPTIONS)
     elsewhere = None
-    if work.launch.spreads:
+    if work.launch.uses_cluster:
         from . import shard_tasks
 
         elsewhere = shard_tasks.elsewhere(work.launch, threads=work.threads, network=given.get("grasp_net"))

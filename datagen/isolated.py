@@ -33,7 +33,7 @@ HEAVY_MASS = 2.0
 """Kilograms of an object that a finger on top cannot press aside, and that can still be lifted."""
 
 
-def alone(rng: np.random.Generator, item: shapes.Item, count: int) -> tuple[Scene, np.ndarray]:
+def random_single_objects(rng: np.random.Generator, item: shapes.Item, count: int) -> tuple[Scene, np.ndarray]:
     """Draw scenes `[count, 1]` of one object of random size, mass and friction, on any side, just above the table.
 
     Returns:
@@ -155,7 +155,7 @@ def share_held(engine: Engine, rng: np.random.Generator, item: shapes.Item, trie
     They are off by MOST_OFFSET and MOST_TURN at most. Objects that cannot be grasped as they lie are not tried; the
     number is 0 if an item never can be.
     """
-    scene, poses = alone(rng, item, 4 * tries)
+    scene, poses = random_single_objects(rng, item, 4 * tries)
     rest = primitives.settle(engine, scene, poses, duration=0.6)
     poses = np.asarray(rest.poses)[:, -1]
     planned = [
@@ -182,7 +182,7 @@ def shares_of_long(engine: Engine, rng: np.random.Generator, tries: int) -> dict
     centred on the same one (`heavy`), which only shows that it can be lifted.
     """
     item = next(item for item in shapes.CATALOGUE if item.name == "cuboid_long")
-    scene, poses = alone(rng, item, tries)
+    scene, poses = random_single_objects(rng, item, tries)
     poses[:, 0, 2] -= 0.002
     poses[:, 0, 3:] = np.asarray(geometry.quat_about_z(np.linspace(0, 3, tries)))
     along = Grasp(poses[:, 0, :2], np.linspace(0, 3, tries), np.full(tries, 0.02))

@@ -126,7 +126,7 @@ def _report(folder: pathlib.Path) -> None:
     """Read what a report reads of a clearing, and make its tables, without drawing."""
     one = comparison.Cleared(folder)
     comparison.flat([one])
-    comparison.course(one, np.linspace(0, 3, 4))
+    comparison.share_left(one, np.linspace(0, 3, 4))
     comparison.results_and_causes([one])
 
 

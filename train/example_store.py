@@ -88,7 +88,7 @@ class ExampleStore:
         state = self._folder / _STATE
         found = files.read_json(state) if state.exists() else {}
         since = found.pop("in_memory_since", None)
-        known = found == self._said and since in (None, machine.boot())
+        known = found == self._said and since in (None, machine.boot_id())
         if not known:
             shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -102,8 +102,8 @@ class ExampleStore:
             for number, (shape, kind) in enumerate(shapes)
         ]
         self._leaves, self._made = mapped[:-1], mapped[-1]
-        if machine.boot():
-            files.write_json(state, self._said | {"in_memory_since": machine.boot()})
+        if machine.boot_id():
+            files.write_json(state, self._said | {"in_memory_since": machine.boot_id()})
 
     def close(self) -> None:
         """Write what is left of examples in files to the disk, so that another process can take them up."""

@@ -25,7 +25,7 @@ from dipn_jax.system.interruption import Interruption
 from . import devices, example_order, finite, log, precision, profiling
 from .configs import DEFAULT_COMPUTE, Compute, TrainConfig, check
 from .optimizers import make_optimizer
-from .prefetch import Ahead
+from .prefetch import Prefetcher
 
 BEST_MEASURE = "held_out_loss"
 """Measure that is lowest at the best step of a run."""
@@ -184,7 +184,7 @@ def _fit(
             saver.save(step, parts, extra=about)
 
     step, saver = begin, saving.Saver(out, network=task.network, config=task.network_config)
-    ahead = Ahead(lambda k: task.fetch(where.rows(np.asarray(batches[k]))), begin, config.steps)
+    ahead = Prefetcher(lambda k: task.fetch(where.rows(np.asarray(batches[k]))), begin, config.steps)
     progress = console.Progress(f"train {task.network}", config.steps, unit="steps", done=begin, quiet=not where.leads)
     profiled = profiling.Profiler(compute.profile if where.leads else None, begin)
     with progress, Interruption() as interruption, saver, profiled, ahead:

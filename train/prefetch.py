@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, Self
 
 
-class Ahead:
+class Prefetcher:
     """The batches of steps that follow one another; it has to be entered (`with`), which starts and ends the thread.
 
     There is one thread, so that batches are made one after another, and an error is raised at the step of its batch.

@@ -111,7 +111,7 @@ class PushTask:
         counted = np.ones(episodes.scene.shape.shape, bool)
         if self.found:
             images = zip(*map(np.asarray, (height, color, label)), strict=True)
-            each = [segment.find(*image, slots=self.slots) for image in images]
+            each = [segment.segment_as(*image, slots=self.slots) for image in images]
             label, counted = np.stack([one[0] for one in each]), np.stack([one[1] for one in each])
         view = self.network_config.view
         return _examples(label, height, episodes, counted, self.centimetres, slots=self.slots, view=view)

@@ -61,7 +61,7 @@ def sweep(
     """
     console.require_out(out)
     console.require_between(1, 1024, at_once=at_once)
-    if launch.spreads and at_once != 1:
+    if launch.uses_cluster and at_once != 1:
         raise UserError("--at-once: for --launcher local; ray runs as many trainings as the cluster has room for")
     from dipn_jax.storage import owner
 
@@ -74,7 +74,7 @@ def sweep(
         todo = [each for each in trainings if listed[each.name]["values"] is None or not each.given["out"].is_dir()]
         sweeping.check(todo)
         files.write_json(out / RECORD, record)
-        run = sweeping.on_cluster(todo, where=launch) if launch.spreads else sweeping.here(todo, at_once=at_once)
+        run = sweeping.on_cluster(todo, where=launch) if launch.uses_cluster else sweeping.here(todo, at_once=at_once)
         with contextlib.closing(run):
             for done, (number, values) in enumerate(run, len(trainings) - len(todo) + 1):
                 listed[todo[number].name]["values"] = values

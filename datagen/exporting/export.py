@@ -68,7 +68,7 @@ def export(data: pathlib.Path, out: pathlib.Path, *, form: str, images: str, com
         files.claim(out, identity)
         for folder in (out, *map(out.joinpath, ("data", "parts", "meta"))):
             for place in (folder, *folder.glob("chunk-*"), *folder.glob("episodes/chunk-*")):
-                temporary.sweep(place)
+                temporary.delete_leftovers(place)
         _write(_writer(source, out, form, images), source, images)
         files.write_text(out / "README.md", card(source, form, images, command))
     train, test = (len(source.episodes(split)) for split in ("train", "test"))

@@ -85,7 +85,7 @@ class Npz:
         """Write a part, whole or not at all; its arrays are on the disk, not in memory, until they are packed."""
         self.path(part).parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            folder = temporary.beside(self.out / "npz")
+            folder = temporary.temporary_path(self.out / "npz")
             folder.mkdir()
             stack.callback(files.remove_folder, folder)
             arrays = {column.name: self._array(folder, column, part.count) for column in self.columns}

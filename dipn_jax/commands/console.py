@@ -133,17 +133,17 @@ class Progress:
 
 def say(text: str) -> None:
     """Print one line for the user on standard output."""
-    print(addresses.named(text), flush=True)
+    print(addresses.with_urls(text), flush=True)
 
 
 def note(text: str) -> None:
     """Print one line for the user on standard error, about how far work is."""
-    print(addresses.named(text), file=sys.stderr, flush=True)
+    print(addresses.with_urls(text), file=sys.stderr, flush=True)
 
 
 def warn(text: str) -> None:
     """Print one warning line on standard error; the command continues."""
-    print(f"warning: {addresses.named(text)}", file=sys.stderr, flush=True)
+    print(f"warning: {addresses.with_urls(text)}", file=sys.stderr, flush=True)
 
 
 def require_positive(**values: float) -> None:
@@ -240,29 +240,29 @@ def exit_code(work: Callable[[], int | None]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except UserError as error:
-        surroundings.complain(f"error: {addresses.named(str(error))}")
+        surroundings.print_error(f"error: {addresses.with_urls(str(error))}")
         return 2
     except OSError as error:
-        surroundings.complain(f"error: {UserError(addresses.named(mended(error)))}")
+        surroundings.print_error(f"error: {UserError(addresses.with_urls(file_to_mend(error)))}")
         return 2
     except MemoryError:
-        surroundings.complain("error: not enough memory; make room, or ask for less at a time")
+        surroundings.print_error("error: not enough memory; make room, or ask for less at a time")
         return 2
     except KeyboardInterrupt:
-        surroundings.complain(INTERRUPTED)
+        surroundings.print_error(INTERRUPTED)
         return 130
     except Exception as error:
         if stopping.number is not None:  # some library's own error for what interrupted it
-            surroundings.complain(INTERRUPTED)
+            surroundings.print_error(INTERRUPTED)
             return 130
-        trouble = surroundings.trouble(error)
+        trouble = surroundings.jax_problem(error)
         if trouble is None:
             raise
-        surroundings.complain(f"error: {UserError(trouble)}")
+        surroundings.print_error(f"error: {UserError(trouble)}")
         return 2
 
 
-def mended(error: OSError) -> str:
+def file_to_mend(error: OSError) -> str:
     """Return the line that says which file the user has to mend."""
     return f"{error.filename or 'files'}: {error.strerror or error}; mend that and try again"
 

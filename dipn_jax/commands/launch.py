@@ -29,11 +29,11 @@ ANSWERS_WITHIN = 20.0
 """Seconds within which a cluster has to accept a connection."""
 RETRIES = 16
 """Times that a task is run again whose process or machine died: machines come and go, but a task can be at fault."""
-MISTAKES = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT)
+USER_FILE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT)
 """Errors of files that end the job: the user has to mend them. Others, as ESTALE, are taken for the machine's own."""
-BROKEN = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT)
+MACHINE_FILE_ERRORS = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT)
 """Errors of files that are the machine's own, too, where a UserError was made of them."""
-PAUSE = 5.0
+RETRY_PAUSE = 5.0
 """Seconds that a task waits which a machine's files have failed, or a broken machine would take the others' tasks."""
 STORE_BYTES = 100 * 2**20
 """Memory for results of tasks, on a cluster that is started here: they are a few words."""
@@ -59,18 +59,18 @@ class Launch:
             raise UserError("--num-cpus, --num-gpus: for --launcher ray only; here, give --threads")
 
     @property
-    def spreads(self) -> bool:
+    def uses_cluster(self) -> bool:
         """Whether the job runs as tasks."""
         return self.launcher != "local"
 
     def begin(self) -> None:
         """Let this process leave a GPU's memory to the tasks of the job; to be called before JAX computes anything."""
-        if self.spreads:
+        if self.uses_cluster:
             _share_gpu()
 
     def threads(self, given: int | None) -> int | None:
         """Return the threads of the native engine: those given, or in a task one per core that it has reserved."""
-        return max(1, int(self.num_cpus)) if self.spreads and given is None else given
+        return max(1, int(self.num_cpus)) if self.uses_cluster and given is None else given
 
 
 LOCAL = Launch()
@@ -168,16 +168,16 @@ def _attempt(function: Callable[..., Any], task: tuple[Any, ...], shares: bool) 
         return _Ended(function(*task))
     except UserError as error:
         # `from None` hides what it was made of, and keeps it
-        passes = isinstance(error.__context__, OSError) and error.__context__.errno in BROKEN
+        passes = isinstance(error.__context__, OSError) and error.__context__.errno in MACHINE_FILE_ERRORS
         said = str(error)
     except OSError as error:
-        passes = error.errno not in MISTAKES
+        passes = error.errno not in USER_FILE_ERRORS
         said = f"{error.filename or 'files'}: {error.strerror or error}"
         said = said if passes else f"on {here}: {said}; mend that and try again"
-    said = addresses.named(said)
+    said = addresses.with_urls(said)
     if not passes:
         return _Ended(mistake=said)
-    time.sleep(PAUSE)
+    time.sleep(RETRY_PAUSE)
     return _Ended(trouble=f"on {here}: {said}", machine=here)
 
 

@@ -25,7 +25,7 @@ def absolute(command: Callable[..., Any]) -> Callable[..., Any]:
         hints = typing.get_type_hints(inspect.unwrap(command), include_extras=True)
         options = inspect.signature(command).bind(*positional, **named).arguments
         for name, value in options.items():
-            options[name] = files.with_absolute_paths(value, urls=addresses.taken(hints.get(name)))
+            options[name] = files.with_absolute_paths(value, urls=addresses.accepts_urls(hints.get(name)))
         return command(**options)
 
     return called
@@ -59,7 +59,7 @@ def registry(arguments: Sequence[str]) -> constructors.ConstructorRegistry:
     def path(words: list[str]) -> pathlib.Path:
         if words[0]:
             return pathlib.Path(words[0])
-        raise UserError(f"{_before_empty(arguments)}{files.EMPTY}")
+        raise UserError(f"{_before_empty(arguments)}{files.EMPTY_PATH_MESSAGE}")
 
     @found.primitive_rule
     def rule(kind: constructors.PrimitiveTypeInfo) -> constructors.PrimitiveConstructorSpec[pathlib.Path] | None:

@@ -44,7 +44,7 @@ def picture(png: bytes, alt: str) -> str:
     return f'<img alt="{escaped(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
 
 
-def alone(title: str, body: str, *, style: str = "", script: str = "") -> str:
+def standalone_page(title: str, body: str, *, style: str = "", script: str = "") -> str:
     """Return a page that loads nothing from elsewhere.
 
     Args:

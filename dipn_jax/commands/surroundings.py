@@ -77,13 +77,13 @@ def open_streams() -> None:
                 stream.reconfigure(errors="backslashreplace")
 
 
-def complain(text: str) -> None:
+def print_error(text: str) -> None:
     """Print a line on standard error, if that can be written to; the exit code says the rest."""
     with contextlib.suppress(OSError):
         print(text, file=sys.stderr, flush=True)
 
 
-def trouble(error: Exception) -> str | None:
+def jax_problem(error: Exception) -> str | None:
     """Return what keeps JAX from being imported or from finding a device to compute on; None where nothing does.
 
     Args:

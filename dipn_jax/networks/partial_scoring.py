@@ -35,21 +35,21 @@ SCORED_WHOLE = 8
 """Images that are scored whole without a rough score, if no more are wanted."""
 FINALISTS = 4
 """Images that are scored whole after the rough scores."""
-SECOND_LOOKS = 16
+SECOND_PASS_IMAGES = 16
 """Images that get the second rough score. Measured on 24 packed rows of 3 to 8 objects: the first score, at half of the
 rotations, was off by a fifth of the differences between images, and ranked the best image ninth once; both scores
 together were off by 3 %, and ranked it first or second."""
-LOOK_TURNS = (tuple(range(0, ROTATIONS // 2, 2)), tuple(range(1, ROTATIONS // 2, 2)))
+PASS_TURNS = (tuple(range(0, ROTATIONS // 2, 2)), tuple(range(1, ROTATIONS // 2, 2)))
 """Rotations of the first and of the second rough score."""
-FELT_PIXELS = (36, 20)
+AFFECTED_PIXELS = (36, 20)
 """Pixels from a change within which scores change: along the closing axis (fingers begin 28 away), and across it."""
-SEEN_PIXELS = 8
+CONTEXT_PIXELS = 8
 """Pixels around those that a rough score takes into account; the network sees 48."""
 WINDOW_CELLS = (20, 28, 36, 44, 56, 80)
 """Possible rows of a window, in cells; even, because the network has a stride of two. Each size is compiled."""
 _VIEW_CELLS = VIEW_PIXELS // CELL_PIXELS
 """Cells along a side of a view."""
-_WIDER_CELLS = 2 * (FELT_PIXELS[0] - FELT_PIXELS[1]) // CELL_PIXELS
+_WIDER_CELLS = 2 * (AFFECTED_PIXELS[0] - AFFECTED_PIXELS[1]) // CELL_PIXELS
 """Cells by which a window has more columns than rows."""
 
 
@@ -77,13 +77,13 @@ def _extents(
     return least, jnp.maximum(jnp.where(there, turned, -far).max(1) - least, 0.0)
 
 
-def _felt(
+def _affected(
     cells: Int[jax.Array, "T S"], least: Float[jax.Array, "T 2"], extent: Float[jax.Array, "T 2"], axis: int
 ) -> Bool[jax.Array, "T S"]:
     """Return which columns (axis 0) or rows (axis 1) of `cells` have a changed pixel in their receptive field."""
     low, high = (
-        least[:, axis, None] - FELT_PIXELS[axis],
-        least[:, axis, None] + extent[:, axis, None] + FELT_PIXELS[axis],
+        least[:, axis, None] - AFFECTED_PIXELS[axis],
+        least[:, axis, None] + extent[:, axis, None] + AFFECTED_PIXELS[axis],
     )
     return (cells >= low // CELL_PIXELS) & (cells <= high // CELL_PIXELS)
 
@@ -135,7 +135,7 @@ def rough_means(
 
         pixels = flat_pixels(image)[cut(there)]
         fresh = _scores(cells(pixels.reshape(*pixels.shape[:3], -1)), pixels[..., 3])
-        cols, lines = (_felt(at[:, i, None] + np.arange(shape[i]), least, extent, i) for i in range(2))
+        cols, lines = (_affected(at[:, i, None] + np.arange(shape[i]), least, extent, i) for i in range(2))
         inside = (lines[:, :, None] & cols[:, None, :])[..., None]
         return jnp.where(inside, cut(weight) * (fresh - cut(before)), 0.0).sum()
 
@@ -144,7 +144,7 @@ def rough_means(
         changed = (image != now).any(-1)
         least, extent = _extents(changed, which)
         needed = (
-            (extent + 2 * (np.array(FELT_PIXELS) + SEEN_PIXELS)) / CELL_PIXELS - np.array([_WIDER_CELLS, 0])
+            (extent + 2 * (np.array(AFFECTED_PIXELS) + CONTEXT_PIXELS)) / CELL_PIXELS - np.array([_WIDER_CELLS, 0])
         ).max()
         size = jnp.minimum(jnp.searchsorted(jnp.array(WINDOW_CELLS), needed), len(WINDOW_CELLS) - 1)
         branches: list[Callable[..., jax.Array]] = [functools.partial(again, rows) for rows in WINDOW_CELLS]
@@ -176,9 +176,9 @@ def mean_and_best(
 
     def shortlist() -> tuple[jax.Array, jax.Array]:
         before = scores_now(network, now)
-        first = rough_means(network, now, before, images, wanted, turns=LOOK_TURNS[0])
-        _, near = jax.lax.top_k(jnp.where(wanted, first, -jnp.inf), min(SECOND_LOOKS, count))
-        second = rough_means(network, now, before, images[near], wanted[near], turns=LOOK_TURNS[1])
+        first = rough_means(network, now, before, images, wanted, turns=PASS_TURNS[0])
+        _, near = jax.lax.top_k(jnp.where(wanted, first, -jnp.inf), min(SECOND_PASS_IMAGES, count))
+        second = rough_means(network, now, before, images[near], wanted[near], turns=PASS_TURNS[1])
         _, best = jax.lax.top_k(jnp.where(wanted[near], first[near] + second, -jnp.inf), min(SCORED_WHOLE, count))
         return near[best], jnp.arange(min(SCORED_WHOLE, count)) < FINALISTS
 

@@ -11,7 +11,7 @@ from dipn_jax.engine import Engine
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
 
-def apart(engine: Engine) -> Engine:
+def group_by_object_count(engine: Engine) -> Engine:
     """Return an engine that simulates only scenes with equal numbers of objects together, if `engine` is `native`.
 
     `native` gives all scenes of a batch as many bodies as the fullest one has. A scene's unused bodies touch nothing,

@@ -77,7 +77,7 @@ def follow(
         if tick < last:
             sims.ctrl[:] = ahead[tick]
             if fence:
-                hold_in(sims, mass, up=times[tick] < fence)
+                apply_fence(sims, mass, up=times[tick] < fence)
             watch.raised(*sims.advance())
             watch.tick(now[tick + 1], deep=times[tick] >= max(fence, faults.GRACE_TIME))
     fault = watch.codes(now[last], settle)
@@ -158,7 +158,7 @@ def unpack(qpos: np.ndarray, poses: np.ndarray, slots: np.ndarray, present: np.n
     return out
 
 
-def hold_in(sims: Worlds, mass: np.ndarray, *, up: bool) -> None:
+def apply_fence(sims: Worlds, mass: np.ndarray, *, up: bool) -> None:
     """Apply the fence's forces for the next control period; none after it has been taken away."""
     shape = mass.shape
     position = np.asarray(sims.qpos)[:, GRIPPER_DOF:].reshape(*shape, 7)[..., :2]

@@ -88,7 +88,7 @@ class Program:
             state, record = carry
             record = recording.store(record, state, ticks == tick)
             ctrl = target(tick * physics.CONTROL_PERIOD + GRIPPER.lag)
-            force = jnp.where(tick < fenced, recording.hold_in(mass, state), 0.0)
+            force = jnp.where(tick < fenced, recording.fence_forces(mass, state), 0.0)
             state = jax.vmap(self._tick)(fields, state, ctrl, force)
             due = target((tick + 1) * physics.CONTROL_PERIOD)
             return state, recording.watch(record, state, scenes, due, deep=tick >= jnp.maximum(fenced, grace))

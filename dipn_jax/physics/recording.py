@@ -36,7 +36,7 @@ class Record(Pytree):
     deepest: Float[Array, "*b"]  # metres: contact, where depth counts
 
 
-def hold_in(mass: Float[Array, "B N"], state: State) -> Float[jax.Array, "B 6+6*N"]:
+def fence_forces(mass: Float[Array, "B N"], state: State) -> Float[jax.Array, "B 6+6*N"]:
     """Return the fence's generalized forces `[B, 6 + 6 N]` on objects of `mass [B, N]`, which is 0 for empty slots."""
     position = state.qpos[:, GRIPPER_DOF:].reshape(*mass.shape, 7)[..., :2]
     velocity = state.qvel[:, GRIPPER_DOF:].reshape(*mass.shape, 6)[..., :2]

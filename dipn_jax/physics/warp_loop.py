@@ -50,7 +50,7 @@ def kernels() -> types.SimpleNamespace:
         ctrl[world, 5] = half
 
     @wp.kernel(enable_backward=False)
-    def hold_in(
+    def apply_fence(
         tick: wp.array[int],
         fence: wp.array[wp.float64],
         mass: wp.array2d[wp.float64],
@@ -120,5 +120,5 @@ def kernels() -> types.SimpleNamespace:
         tick[0] = tick[0] + 1
 
     return types.SimpleNamespace(
-        steer=steer, hold_in=hold_in, count=count, watch=watch, note_depth=note_depth, advance=advance
+        steer=steer, apply_fence=apply_fence, count=count, watch=watch, note_depth=note_depth, advance=advance
     )

@@ -150,9 +150,8 @@ class Worlds:
         launch, do, data, paths = self.warp.launch, self.kernels, self.data, (self.tick, self.time, self.frame)
         worlds, slots = self.mass.shape
         launch(do.steer, worlds, [*paths, data.ctrl])
-        launch(
-            do.hold_in, (worlds, slots, 2), [self.tick, self.fence, self.mass, data.qpos, data.qvel, data.qfrc_applied]
-        )
+        fenced = [self.tick, self.fence, self.mass, data.qpos, data.qvel, data.qfrc_applied]
+        launch(do.apply_fence, (worlds, slots, 2), fenced)
         for _ in range(substeps):
             self.mjw.step(self.model, data)
             launch(do.count, worlds, [data.solver_niter, self.histogram])

@@ -220,7 +220,7 @@ def discount_missed(scores: Float[Array, "R H W"], missed: Int[Array, "M 3"]) ->
     return jnp.minimum(scores, scores * 0.5**count)
 
 
-def without(scores: Float[Array, "R H W"], grasp: Int[Array, " 3"]) -> Float[jax.Array, "R H W"]:
+def exclude_near(scores: Float[Array, "R H W"], grasp: Int[Array, " 3"]) -> Float[jax.Array, "R H W"]:
     """Return the scores with -1 for all grasps that are less than APART_PIXELS from a grasp `[3]`."""
     away = geometry.view_grid(*scores.shape[1:]) - jnp.asarray(grasp)[::-1][:2]
     return jnp.where(jnp.linalg.norm(away, axis=-1) < APART_PIXELS, -1.0, scores)
@@ -231,6 +231,6 @@ def best_grasps(scores: Float[Array, "R H W"], *, count: int) -> Int[jax.Array, 
 
     def next_best(left: Array, _: None) -> tuple[Array, jax.Array]:
         index = best_grasp(left)[0]
-        return without(left, index), index
+        return exclude_near(left, index), index
 
     return jax.lax.scan(next_best, scores, None, length=count)[1]

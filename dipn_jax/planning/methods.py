@@ -17,8 +17,8 @@ from jaxtyping import Float, Int, Key
 from dipn_jax.errors import UserError
 from dipn_jax.names import Aid, MethodName
 from dipn_jax.networks import vpg
-from dipn_jax.planning import deciding, expected_misses, planner, predictors, scorers
-from dipn_jax.planning.deciding import DecideFunction
+from dipn_jax.planning import expected_misses, planner, predictors, scorers
+from dipn_jax.planning.decide_functions import DecideFunction, decide_by_imagining, decide_by_values
 from dipn_jax.planning.planner import Predictor, Rule, Scorer, ScoreSummary
 from dipn_jax.planning.policy_config import DEFAULT_CONFIG, PolicyConfig
 from dipn_jax.sight import observed
@@ -64,12 +64,12 @@ class Policy:
         if not observed.is_traced(observation):
             forking.check()
             observed.check_observation(observation)
-            observed.require_reach(observation)
+            observed.require_graspable_height(observation)
         return self.decide_function(key, observation, missed, self.rule, self.distances)
 
     def with_config(self, config: PolicyConfig) -> Policy:
         """Return a policy of the same networks with another rule and other distances; as many candidates as before."""
-        return dataclasses.replace(self, rule=config.rule(), distances=config.spread())
+        return dataclasses.replace(self, rule=config.rule(), distances=config.candidate_distances())
 
 
 Runs = dict[str, pathlib.Path]
@@ -179,7 +179,7 @@ def _of_shipped(
 
 def grasping_policy(scorer: Scorer, config: PolicyConfig = DEFAULT_CONFIG) -> Policy:
     """Return the policy that grasps where `scorer` is highest, and never pushes."""
-    decide = deciding.decide_by_imagining(predictors.static_predictor, scorer, None)
+    decide = decide_by_imagining(predictors.static_predictor, scorer, None)
     return Policy(decide, config.rule().replace(grasp_above=-1.0), np.array([0.1], np.float32))
 
 
@@ -197,36 +197,36 @@ def _predictor(runs: Runs, config: PolicyConfig) -> Predictor:
 
 
 def _dipn_gn(runs: Runs, config: PolicyConfig) -> Policy:
-    decide = deciding.decide_by_imagining(_predictor(runs, config), *gn_scores(runs["grasp"], config))
-    return Policy(decide, config.rule(), config.spread())
+    decide = decide_by_imagining(_predictor(runs, config), *gn_scores(runs["grasp"], config))
+    return Policy(decide, config.rule(), config.candidate_distances())
 
 
 def _dipn_gn_actions(runs: Runs, config: PolicyConfig) -> Policy:
     scorer, summarize = gn_scores(runs["grasp"], config)
     estimate = expected_misses.misses_to_come(scorer)
-    decide = deciding.decide_by_imagining(_predictor(runs, config), scorer, summarize, estimate=estimate)
-    return Policy(decide, config.rule(), config.spread())
+    decide = decide_by_imagining(_predictor(runs, config), scorer, summarize, estimate=estimate)
+    return Policy(decide, config.rule(), config.candidate_distances())
 
 
 def _rea_dipn(runs: Runs, config: PolicyConfig) -> Policy:
     table = "table" in config.aids
     summary = scorers.load_summary(runs["value"], network="vpg", whole=config.released, table=table)
-    decide = deciding.decide_by_imagining(_predictor(runs, config), _chances(runs["value"], config.aids), summary)
-    return Policy(decide, config.rule(), config.spread())
+    decide = decide_by_imagining(_predictor(runs, config), _chances(runs["value"], config.aids), summary)
+    return Policy(decide, config.rule(), config.candidate_distances())
 
 
 def _dqn_gn(runs: Runs, config: PolicyConfig) -> Policy:
     scorer = scorers.load_scorer(runs["grasp"], aids=config.aids)
-    network_scores = scorers.load_plain_scorer(runs["grasp"], table="table" in config.aids)
-    decide = deciding.decide_by_values(_part(runs["value"], "push"), scorer, network_scores, grasp_at_once=True)
-    return Policy(decide, config.rule(), config.spread())
+    network_scores = scorers.load_unaided_scorer(runs["grasp"], table="table" in config.aids)
+    decide = decide_by_values(_part(runs["value"], "push"), scorer, network_scores, grasp_at_once=True)
+    return Policy(decide, config.rule(), config.candidate_distances())
 
 
 def _vpg(runs: Runs, config: PolicyConfig) -> Policy:
     pushes, grasps = _part(runs["value"], "push"), _part(runs["value"], "grasp", config.aids)
     table: tuple[Aid, ...] = ("table",) if "table" in config.aids else ()
-    decide = deciding.decide_by_values(pushes, grasps, _part(runs["value"], "grasp", table), grasp_at_once=False)
-    return Policy(decide, config.rule(), config.spread())
+    decide = decide_by_values(pushes, grasps, _part(runs["value"], "grasp", table), grasp_at_once=False)
+    return Policy(decide, config.rule(), config.candidate_distances())
 
 
 def _gn(runs: Runs, config: PolicyConfig) -> Policy:

@@ -181,7 +181,7 @@ def _count_actions(
     return decision.replace(is_push=cost < now, value_now=-now, value_push=-cost)
 
 
-@functools.partial(observed.guarded, reach=True)
+@functools.partial(observed.guarded, refuse_low_tables=True)
 @functools.partial(jax.jit, static_argnames=("predictor", "scorer", "count", "summarize", "estimate"))
 def decide(
     key: Key[Array, ""],
@@ -235,7 +235,7 @@ def decide(
 
 
 @functools.partial(jax.jit, static_argnames=("push_scorer", "scorer", "network_scores"))
-def decide_by_value(
+def decide_without_imagining(
     observation: Observation,
     push_scorer: Scorer,
     scorer: Scorer,

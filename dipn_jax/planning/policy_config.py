@@ -55,7 +55,7 @@ class PolicyConfig:
         result: Rule = rule.replace(gamma=self.gamma, grasp_above=self.grasp_above, draw_all=small, top_margin=margin)
         return result
 
-    def spread(self) -> Float[np.ndarray, " P"]:
+    def candidate_distances(self) -> Float[np.ndarray, " P"]:
         """Return the distance of each candidate in metres."""
         return np.resize(np.asarray(self.distances, np.float32), self.candidates)
 

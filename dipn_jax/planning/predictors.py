@@ -26,7 +26,7 @@ def trans_predictor(observation: Observation, pushes: Push) -> Float[jax.Array, 
     """Predict that only the pushed object moves, by the push length along the push: a baseline, a Predictor."""
 
     def one(label: Array, push: Push) -> jax.Array:
-        hit = imagine.move_toward(label, push.start, push.angle)
+        hit = imagine.first_object_hit(label, push.start, push.angle)
         shift = push.distance * jnp.stack([jnp.cos(push.angle), jnp.sin(push.angle), jnp.zeros(())])
         return jnp.where(((jnp.arange(observation.slots) == hit) & (hit != ABSENT))[:, None], shift, 0.0)
 

@@ -43,7 +43,7 @@ def aided_scorer(model: grasp.GraspNet, *, aids: Collection[Aid] = ALL_AIDS) -> 
     return _scorer(model, functools.partial(grasp.aided_scores, aids=tuple(aids)))
 
 
-def plain_scorer(model: grasp.GraspNet, *, table: bool = True) -> Scorer:
+def unaided_scorer(model: grasp.GraspNet, *, table: bool = True) -> Scorer:
     """Return GN as a scorer with its scores as they are, but 0 for grasps centred on empty table if `table` is True."""
     return _scorer(model, functools.partial(grasp.score_image, table=table))
 
@@ -55,7 +55,7 @@ def grasp_summary(model: grasp.GraspNet, *, table: bool = True) -> ScoreSummary:
     are scored whole. The highest score of the fast way is not that of the image.
     """
     if model.config.preset != "compact" or jax.default_backend() != "cpu" or not table:
-        return planner.summarize_whole(plain_scorer(model, table=table))
+        return planner.summarize_whole(unaided_scorer(model, table=table))
     thaw = _frozen(model)
 
     def summarize(
@@ -84,13 +84,13 @@ def value_scorers(model: vpg.VPG, *, aids: Collection[Aid] = TABLE_AID) -> tuple
     )
 
 
-def load_plain_scorer(run: pathlib.Path | str, *, table: bool = True) -> Scorer:
-    """Load the scorer of a `dipn-train grasp` run, or `builtin`, with its scores as they are; see `plain_scorer`.
+def load_unaided_scorer(run: pathlib.Path | str, *, table: bool = True) -> Scorer:
+    """Load the scorer of a `dipn-train grasp` run, or `builtin`, with its scores as they are; see `unaided_scorer`.
 
     Raises:
       UserError: as `checkpoint.load_network`.
     """
-    return plain_scorer(checkpoint.load_network(pathlib.Path(run), network="grasp"), table=table)  # type: ignore[arg-type]
+    return unaided_scorer(checkpoint.load_network(pathlib.Path(run), network="grasp"), table=table)  # type: ignore[arg-type]
 
 
 def load_scorer(run: pathlib.Path | str, *, aids: Collection[Aid] = ALL_AIDS) -> Scorer:
@@ -132,4 +132,4 @@ def load_summary(
     """
     model: Any = checkpoint.load_network(pathlib.Path(run), network=network)
     grasps = model.grasp if network == "vpg" else model
-    return planner.summarize_whole(plain_scorer(grasps, table=table)) if whole else grasp_summary(grasps, table=table)
+    return planner.summarize_whole(unaided_scorer(grasps, table=table)) if whole else grasp_summary(grasps, table=table)

@@ -59,7 +59,7 @@ def imagine(observation: Observation, centers: Float[Array, "N 2"], motion: Floa
     return Observation(image[..., 3], image[..., :3], image[..., 4].astype(jnp.int32), observation.slots)
 
 
-def move_toward(
+def first_object_hit(
     label: Int[Array, "H W"], start: Float[Array, " 2"], angle: Float[Array, ""] | float
 ) -> Int[jax.Array, ""]:
     """Return the object that the middle of a push from `start` (metres) along `angle` meets first, or ABSENT."""

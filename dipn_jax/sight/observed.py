@@ -74,14 +74,14 @@ def is_traced(observation: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(observation))
 
 
-def guarded(function: F, *, reach: bool = False) -> F:
+def guarded(function: F, *, refuse_low_tables: bool = False) -> F:
     """Return a compiled function that first checks its argument `observation`, unless it is being traced; a decorator.
 
     A forked process in which JAX would hang is refused, too (`forking.check`).
 
     Args:
       function: has an argument `observation`.
-      reach: also refuse a table on which nothing is high enough to be grasped.
+      refuse_low_tables: also refuse a table on which nothing is high enough to be grasped.
     """
     signature = inspect.signature(function)
 
@@ -91,14 +91,14 @@ def guarded(function: F, *, reach: bool = False) -> F:
         if not is_traced(given):
             forking.check()
             check_observation(given)
-            if reach:
-                require_reach(given)
+            if refuse_low_tables:
+                require_graspable_height(given)
         return function(*positional, **named)
 
     return cast(F, checked)
 
 
-def require_reach(observation: Observation) -> None:
+def require_graspable_height(observation: Observation) -> None:
     """Raise a UserError where there are objects, and none is high enough for the fingers to close on."""
     objects = np.asarray(observation.label) != ABSENT
     highest = np.asarray(observation.height)[objects].max(initial=-np.inf)

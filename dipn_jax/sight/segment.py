@@ -176,7 +176,7 @@ def match(found: Int[Array, "H W"], true: Int[Array, "H W"], *, slots: int) -> I
     return result
 
 
-def find(
+def segment_as(
     height: Real[Array, "224 224"], color: Real[Array, "224 224 3"], true: Int[Array, "224 224"], *, slots: int
 ) -> tuple[Int[np.ndarray, "224 224"], Bool[np.ndarray, " {slots}"]]:
     """Find masks in one image, numbered as the objects that they overlap most; the rest take the numbers left over.

@@ -79,7 +79,7 @@ def save(
       keep: number of steps that are kept.
     """
     final = run.resolve() / "checkpoints" / f"{step:08d}"
-    begun = temporary.beside(final)
+    begun = temporary.temporary_path(final)
     about = {"network": network, "network_config": dataclasses.asdict(config), "step": step}
     try:
         _write(begun, parts, about, extra)
@@ -100,9 +100,9 @@ def _write(folder: pathlib.Path, parts: dict[str, Any], about: dict[str, Any], e
       UserError: there is no space for it.
     """
     folder.mkdir(parents=True)
-    checkpointer = ocp.StandardCheckpointer(multiprocessing_options=stored_step.alone())
+    checkpointer = ocp.StandardCheckpointer(multiprocessing_options=stored_step.single_process_options())
     try:
-        with quiet.failing():  # what Orbax prints is said in one line below
+        with quiet.failed_saves():  # what Orbax prints is said in one line below
             for name, tree in parts.items():
                 checkpointer.save(folder / name, _flat(tree))
             checkpointer.wait_until_finished()

@@ -131,5 +131,5 @@ def _turn(folder: pathlib.Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             if fcntl is not None:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-        temporary.sweep(folder, shared=True)
+        temporary.delete_leftovers(folder, shared=True)
         yield

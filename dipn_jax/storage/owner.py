@@ -41,7 +41,7 @@ def owned(out: pathlib.Path) -> Iterator[None]:
         about = {"host": socket.gethostname(), "pid": os.getpid(), "started": started}
         os.write(descriptor, (json.dumps(about) + "\n").encode())
         for folder in (out, out / "checkpoints"):
-            temporary.sweep(folder)
+            temporary.delete_leftovers(folder)
         yield
     finally:
         path.unlink(missing_ok=True)

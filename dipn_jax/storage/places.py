@@ -20,7 +20,7 @@ from dipn_jax.storage.manifest import MANIFEST
 from dipn_jax.storage.objects import Bucket
 from dipn_jax.system import addresses, files, temporary
 
-FEW = 8
+MAX_HEAD_REQUESTS = 8
 """Number of shards up to which each is asked for by its name; for more of them, the whole bucket is listed."""
 Claim = Callable[[pathlib.Path], None]
 """Writes the configuration of a data set to its folder, or raises UserError if another one is there."""
@@ -75,7 +75,7 @@ class Folder:
 
     def claim(self, claim: Claim) -> None:
         claim(self.folder)
-        temporary.sweep(self.folder, shared=True)
+        temporary.delete_leftovers(self.folder, shared=True)
 
     def note(self, command: Sequence[str], *, of: int) -> None:
         accounting.note(self.folder, command, of=of)
@@ -138,7 +138,7 @@ class Objects:
         A few cost a request each, however many there are in the bucket.
         """
         asked = {index: _name(index) for index in indices}
-        if len(asked) > FEW:
+        if len(asked) > MAX_HEAD_REQUESTS:
             there = self._bucket.list()
         else:
             there = {name: found for name in asked.values() if (found := self._bucket.head(name))}

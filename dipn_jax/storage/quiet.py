@@ -15,7 +15,7 @@ def _printed(record: logging.LogRecord) -> bool:
 
 
 @contextlib.contextmanager
-def failing() -> Iterator[None]:
+def failed_saves() -> Iterator[None]:
     """Keep Orbax from printing tracebacks of a save that fails, within a `with` statement.
 
     TensorStore's threads may report to Orbax's event loop after it was closed, and asyncio reports failed writes that

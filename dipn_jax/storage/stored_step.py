@@ -76,7 +76,7 @@ def require_room(part: pathlib.Path, config: Any) -> None:
                 raise UserError(f"checkpoint {part}: its config is of a larger network than its arrays; train again")
 
 
-def alone() -> ocp.options.MultiprocessingOptions:
+def single_process_options() -> ocp.options.MultiprocessingOptions:
     """Return Orbax's options for a process that reads or writes by itself, whatever the others of its job do."""
     me = jax.process_index()
     return ocp.options.MultiprocessingOptions(
@@ -85,8 +85,8 @@ def alone() -> ocp.options.MultiprocessingOptions:
 
 
 def _reader() -> ocp.Checkpointer:
-    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone())
-    return ocp.Checkpointer(handler, multiprocessing_options=alone())
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=single_process_options())
+    return ocp.Checkpointer(handler, multiprocessing_options=single_process_options())
 
 
 def arrays(part: pathlib.Path) -> dict[str, np.ndarray]:

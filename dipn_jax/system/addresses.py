@@ -24,9 +24,9 @@ def url(place: pathlib.Path | str) -> str | None:
     return found and f"{found[1]}://{'/' if found[1] == 'file' else ''}{(found[2] or '').rstrip('/')}"
 
 
-def taken(hint: Any) -> bool:
+def accepts_urls(hint: Any) -> bool:
     """Return whether an option of this type accepts URLs: it is a `Place`, or several."""
-    return OR_URL in getattr(hint, "__metadata__", ()) or any(map(taken, typing.get_args(hint)))
+    return OR_URL in getattr(hint, "__metadata__", ()) or any(map(accepts_urls, typing.get_args(hint)))
 
 
 def show_instead(folder: pathlib.Path, url: str) -> None:
@@ -34,7 +34,7 @@ def show_instead(folder: pathlib.Path, url: str) -> None:
     _names[str(folder)] = url
 
 
-def named(text: str) -> str:
+def with_urls(text: str) -> str:
     """Return `text` with URLs in place of the folders that `show_instead` was given."""
     for folder, name in _names.items():
         text = text.replace(folder, name)

@@ -21,7 +21,7 @@ from typing import Any
 from dipn_jax.errors import UserError
 from dipn_jax.system import addresses, temporary, typed
 
-EMPTY = "'': an empty path, as of a variable that is not set; give a path, or . for this folder"
+EMPTY_PATH_MESSAGE = "'': an empty path, as of a variable that is not set; give a path, or . for this folder"
 """What is said of an empty path."""
 _BUILTIN = re.compile(r"builtin(@(best|\d+))?")
 
@@ -91,7 +91,7 @@ def not_empty(path: pathlib.Path | str) -> pathlib.Path:
       UserError: it is an empty text.
     """
     if path == "":
-        raise UserError(EMPTY)
+        raise UserError(EMPTY_PATH_MESSAGE)
     return pathlib.Path(path)
 
 
@@ -144,7 +144,7 @@ def replacing(path: pathlib.Path) -> Iterator[pathlib.Path]:
     Where something is raised, nothing of it is left.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    there = temporary.beside(path)
+    there = temporary.temporary_path(path)
     try:
         yield there
         move(there, path)

@@ -29,7 +29,7 @@ def instructions(*, info: pathlib.Path = pathlib.Path("/proc/cpuinfo")) -> str:
     return next((level for level, needed in levels.items() if needed <= flags), platform.machine().replace("_", "-"))
 
 
-def boot(*, file: pathlib.Path = pathlib.Path("/proc/sys/kernel/random/boot_id")) -> str | None:
+def boot_id(*, file: pathlib.Path = pathlib.Path("/proc/sys/kernel/random/boot_id")) -> str | None:
     """Return what tells this start of the machine from others; None where the system does not say it.
 
     Args:

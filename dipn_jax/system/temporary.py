@@ -12,7 +12,7 @@ import shutil
 import socket
 
 
-def beside(path: pathlib.Path) -> pathlib.Path:
+def temporary_path(path: pathlib.Path) -> pathlib.Path:
     """Return a temporary path in the folder of `path`: `.NAME.HOST-PID-TOKEN.tmp`."""
     token = secrets.token_hex(4)  # workers in containers may share process numbers
     return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{token}.tmp")
@@ -28,7 +28,7 @@ def _host() -> str:
     return hashlib.sha256("".join(known).encode()).hexdigest()[:8]
 
 
-def sweep(folder: pathlib.Path, *, shared: bool = False) -> None:
+def delete_leftovers(folder: pathlib.Path, *, shared: bool = False) -> None:
     """Delete the temporary files and folders in `folder` that dead processes have left.
 
     Args:

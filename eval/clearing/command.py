@@ -95,8 +95,9 @@ def clear(
     )
     share.check(launch)
     launch.begin()
-    networks, physics = Networks(push_net, grasp_net, value_net), grouped.apart(make_engine(engine, threads=threads))
-    if launch.spreads:
+    networks = Networks(push_net, grasp_net, value_net)
+    physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
+    if launch.uses_cluster:
         launching.evaluate(
             "clear", asked, resume.Partial(out, given, inputs=evaluation.inputs(networks.runs(method), tables))
         )

@@ -12,7 +12,7 @@ from dipn_jax import batching
 from dipn_jax.engine import Engine
 from dipn_jax.errors import UserError
 from dipn_jax.planning import methods
-from dipn_jax.planning.deciding import DecideFunction
+from dipn_jax.planning.decide_functions import DecideFunction
 from dipn_jax.planning.methods import Networks, Policy
 from dipn_jax.planning.planner import Rule
 from dipn_jax.planning.policy_config import PolicyConfig
@@ -48,7 +48,7 @@ def load(
             raise UserError(f"--method {method}: decides on the simulator's state; give --masks true, and no noise")
         scorer, summarize = methods.gn_scores(runs["grasp"], configs[0])
         decide = functools.partial(rollouts.decide_by_simulation, scorer=scorer, summarize=summarize, engine=engine)
-        return [functools.partial(decide, rule=each.rule(), distances=each.spread()) for each in configs]
+        return [functools.partial(decide, rule=each.rule(), distances=each.candidate_distances()) for each in configs]
     policy = methods.build(found, runs, configs[0])
     if not found.pushes:
         return [in_lockstep(policy, camera=camera)] * len(configs)

@@ -96,10 +96,11 @@ def sweep(
         raise UserError(f"--of {share.of}: more workers than --pushes {pushes}; want at most {pushes}, or --pushes 0")
     configs = {sweeping.name(each): dataclasses.replace(chosen, distances=(each,)) for each in every}
     configs[sweeping.CHOSEN] = chosen
-    networks, physics = Networks(push_net, grasp_net), grouped.apart(make_engine(engine, threads=threads))
+    networks = Networks(push_net, grasp_net)
+    physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
     inputs = evaluation.inputs(networks.runs("dipn+gn"), tables)
     kept = resume.Partial(out, given, inputs=inputs, part=share.named())
-    if launch.spreads:
+    if launch.uses_cluster:
         launching.evaluate("sweep", asked, kept)
         return
     command = command_line.words(sweep, asked, without=command_line.WORKER_OPTIONS)

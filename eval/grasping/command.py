@@ -87,8 +87,9 @@ def grasp(
     partial = resume.Partial(out, settings, inputs=[run] if run else [], part=share.named())
     online = curves.grasp_summary(curves.load_grasp_runs(curve)) if curve else None
     if run:
-        physics, scorer = grouped.apart(make_engine(engine, threads=threads)), scorers.load_scorer(run, aids=aids)
-    if launch.spreads:
+        physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
+        scorer = scorers.load_scorer(run, aids=aids)
+    if launch.uses_cluster:
         launching.evaluate("grasp", asked, partial)
         return
     with owner.owned(out):

@@ -161,7 +161,7 @@ def _next_best(seen: Observation, missed: jax.Array, tried: jax.Array, *, scorer
     def one(args: tuple[Observation, jax.Array, jax.Array]) -> Grasp:
         image, known, first = args
         scores = candidates.discount_missed(scorer(render.rgbd(image)[None])[0], known)
-        best = candidates.best_grasps(candidates.without(scores, first), count=count)
+        best = candidates.best_grasps(candidates.exclude_near(scores, first), count=count)
         return candidates.grasp_at(best, image.height)
 
     return jax.lax.map(one, (seen, missed, tried))

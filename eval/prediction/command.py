@@ -75,7 +75,7 @@ def predict(
     networks, compared, runs = _load(push_net, curve)
     partial = resume.Partial(out, settings, inputs=runs, part=share.named())
     truth = make_engine(engine, threads=threads)
-    if launch.spreads:
+    if launch.uses_cluster:
         launching.evaluate("prediction", asked, partial)
         return
     with owner.owned(out):

@@ -160,7 +160,7 @@ def at_distances(predictor: Callable[[Observation, Push], jax.Array]) -> Predict
 def _found(seen: Observation, slots: int) -> np.ndarray:
     """Find masks in the images and return their labels `[B, H, W]`, numbered as the objects that they overlap most."""
     images = zip(seen.height, seen.color, seen.label, strict=True)
-    return np.stack([segment.find(*image, slots=slots)[0] for image in images])
+    return np.stack([segment.segment_as(*image, slots=slots)[0] for image in images])
 
 
 def measure(

@@ -160,7 +160,7 @@ def _causes(rows: list[Cleared]) -> str:
     return pages.table(["", *CAUSES.values(), "not cleared"], lines)
 
 
-def course(one: Cleared, at: np.ndarray) -> np.ndarray:
+def share_left(one: Cleared, at: np.ndarray) -> np.ndarray:
     """Return the share of objects left after `at [A]` actions per object, averaged over tables: `[A]`."""
     shares = []
     for entry in one.episodes:
@@ -174,7 +174,7 @@ def _courses(rows: list[Cleared]) -> Any:
     figure, axis = plt.subplots(figsize=(6, 3.5))
     at = np.linspace(0, lockstep.ACTIONS_PER_OBJECT, 61)
     for one in rows:
-        axis.plot(at, 100 * course(one, at), label=drawing.label(one.name))
+        axis.plot(at, 100 * share_left(one, at), label=drawing.label(one.name))
     axis.plot(at, 100 * np.maximum(1 - at, 0), color="0.7", lw=1, ls=":", label="an object an action")
     axis.set(xlabel="actions an object", ylabel="objects left, %", ylim=(0, 102))
     axis.grid(alpha=0.3)

@@ -57,7 +57,7 @@ def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
         body = body.replace(f"{{{name}}}", drawing.image(figure, out / "pictures" / f"{name}.png"))
     versions = ", ".join(f"{k} {v}" for k, v in files.package_versions().items())
     body = f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {pages.escaped(versions)}.</p>'
-    page = pages.alone("dipn-jax report", body)
+    page = pages.standalone_page("dipn-jax report", body)
     files.write_text(out / "report.html", page)
     files.write_json(out / "metrics.json", values)
     return values

@@ -75,7 +75,7 @@ def make_part(kind: str, given: dict[str, Any]) -> None:
     from .. import cli
 
     target = place(given["out"], given["share"])
-    own = temporary.beside(target)
+    own = temporary.temporary_path(target)
     try:
         commands: dict[str, Any] = cli.COMMANDS
         commands[kind](**{**given, "out": own})

@@ -51,9 +51,9 @@ class Share:
 
     def check(self, launch: Launch) -> None:
         """Raise a UserError for a share that does not fit the way in which the evaluation is launched."""
-        if not launch.spreads and self.shard is None and self.of > 1:
+        if not launch.uses_cluster and self.shard is None and self.of > 1:
             raise UserError(f"--of {self.of}: give --shard, too: this worker's number, 0 to {self.of - 1}")
-        if launch.spreads and (self.shard is not None or self.of < 2):
+        if launch.uses_cluster and (self.shard is not None or self.of < 2):
             raise UserError("--launcher ray makes all shards: give --of, their number, 2 or more, and no --shard")
 
     def rows(self, total: int) -> range:

@@ -111,7 +111,7 @@ def test_what_a_job_asks_of_a_bucket_grows_by_its_shards_alone(
             assert console.run("test", cli.COMMANDS, [*words, "--out", out, "--launcher", "ray"]) == 0
         return asked
 
-    few, many = requests(places.FEW + 1), requests(places.FEW + 4)
+    few, many = requests(places.MAX_HEAD_REQUESTS + 1), requests(places.MAX_HEAD_REQUESTS + 4)
     assert many - few == {"get config.json": 3, "head shard": 3, "put shard": 3}
     assert few["list"] == 3 and few["get manifest.json"] == 1
 

@@ -9,10 +9,13 @@ from dipn_jax.eval import cli
 from dipn_jax.commands import console
 from dipn_jax.storage import owner
 
-_FEW = ("--cases", "random", "--objects", "1")
+_ONE_OBJECT = ("--cases", "random", "--objects", "1")
 COMMANDS = {
-    "clear": ("--method", "gn", "--grasp-net", "grasp", *_FEW),
-    "sweep": ("--push-net", "dipn", "--grasp-net", "grasp", "--distances", "0.05:0.05:0.01", "--pushes", "0", *_FEW),
+    "clear": ("--method", "gn", "--grasp-net", "grasp", *_ONE_OBJECT),
+    "sweep": (
+        *("--push-net", "dipn", "--grasp-net", "grasp", "--distances", "0.05:0.05:0.01", "--pushes", "0"),
+        *_ONE_OBJECT,
+    ),
     "grasp": ("--grasp-net", "grasp", "--scenes", "1", "--objects", "1"),
     "prediction": ("--push-net", "dipn", "--scenes", "1", "--objects", "1"),
 }

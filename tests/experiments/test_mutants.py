@@ -15,7 +15,7 @@ from experiments import mutants, mutants_session, pages
 ROOT = pathlib.Path(__file__).parent.parent.parent
 
 
-ALIKE = {
+EQUIVALENT_MUTANTS = {
     # metrics: axes of arrays of two axes, and NumPy takes every negative number for "what is left"
     "return np.where(np.arange(sizes.max()) < sizes[chosen][..., None], pick, -1).reshape(RESAMPLES, - 2)",
     "return np.append(values, 0.0)[pick].sum(1)",
@@ -56,7 +56,7 @@ def test_no_survivor_counts_or_ends_a_table_or_computes_an_interval() -> None:
     values = _kept()
     for module in ("eval/metrics.py", "eval/clearing/lockstep.py"):
         survivors = values.get(module, {"survivors": []})["survivors"]
-        assert {each["became"] for each in survivors} <= ALIKE, module
+        assert {each["became"] for each in survivors} <= EQUIVALENT_MUTANTS, module
 
 
 def test_a_dry_run_shows_the_tests_of_a_module(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:

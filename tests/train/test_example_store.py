@@ -71,7 +71,7 @@ def test_a_disk_that_is_nearly_full_is_one_line(tmp_path: pathlib.Path, monkeypa
 def test_what_was_closed_is_taken_up_and_nothing_else(
     tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(machine, "boot", lambda: None)
+    monkeypatch.setattr(machine, "boot_id", lambda: None)
     store, _ = _store(tmp_path / "s")
     _check(store, [1, 2])
     store.close()
@@ -104,16 +104,16 @@ os.kill(os.getpid(), signal.SIGKILL)
 """A process that makes three examples and is killed."""
 
 
-@pytest.mark.skipif(machine.boot() is None, reason="this system does not tell its starts apart")
+@pytest.mark.skipif(machine.boot_id() is None, reason="this system does not tell its starts apart")
 def test_what_a_killed_process_made_is_used_unless_the_machine_was_started_since(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for boot, made in (machine.boot(), [1, 5]), ("another", [1, 2, 5, 70]):
+    for boot, made in (machine.boot_id(), [1, 5]), ("another", [1, 2, 5, 70]):
         killed = subprocess.run(
             [sys.executable, "-c", KILLED, str(tmp_path / "s")], check=False, stdout=subprocess.PIPE
         )
         assert killed.returncode == -signal.SIGKILL
-        monkeypatch.setattr(machine, "boot", lambda boot=boot: boot)
+        monkeypatch.setattr(machine, "boot_id", lambda boot=boot: boot)
         store, maker = _store(tmp_path / "s")
         _check(store, [1, 2, 5, 70])
         assert sorted(set(maker.made)) == made, "the first one is made in any case, to see shapes"

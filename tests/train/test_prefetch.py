@@ -3,7 +3,7 @@
 import threading
 
 import pytest
-from dipn_jax.train.prefetch import Ahead
+from dipn_jax.train.prefetch import Prefetcher
 
 
 def test_batches_come_in_order_and_the_next_is_made_meanwhile() -> None:
@@ -15,7 +15,7 @@ def test_batches_come_in_order_and_the_next_is_made_meanwhile() -> None:
         begun[step].set()
         return 10 * step
 
-    with Ahead(make, 3, 6) as ahead:
+    with Prefetcher(make, 3, 6) as ahead:
         for step in range(3, 6):
             assert ahead.take() == 10 * step
             assert step == 5 or begun[step + 1].wait(10), "without being asked for"
@@ -28,7 +28,7 @@ def test_an_error_is_raised_at_the_step_of_its_batch_and_the_thread_ends() -> No
             raise ValueError("no room")
         return step
 
-    with pytest.raises(ValueError, match="no room"), Ahead(make, 0, 3) as ahead:
+    with pytest.raises(ValueError, match="no room"), Prefetcher(make, 0, 3) as ahead:
         assert ahead.take() == 0
         ahead.take()
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("batches")]

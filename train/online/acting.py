@@ -160,7 +160,7 @@ def push_reward(now: Look, then: Look, *, method: str) -> np.ndarray:
     return np.where(different & (gained >= COVERED_PIXELS), reward, 0.0)
 
 
-def with_future(reward: np.ndarray, then: Look, more: Array) -> np.ndarray:
+def q_targets(reward: np.ndarray, then: Look, more: Array) -> np.ndarray:
     """Return targets `[T]` of Q-learning: reward, plus the discounted value of the best next action if there is one.
 
     Args:

@@ -203,7 +203,7 @@ def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneC
     reward = np.where(pushing, acting.push_reward(now, then, method=config.method), success.astype(float))
     target = reward
     if config.method != "rea":
-        target = acting.with_future(reward, then, (scene.shape >= 0).any(1) & effect)
+        target = acting.q_targets(reward, then, (scene.shape >= 0).any(1) & effect)
     for name, rows, centre, angle in (
         ("push", pushing & good, now.push.start, now.push.angle),
         ("grasp", ~pushing & good, now.grasp.center, now.grasp.angle),

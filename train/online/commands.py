@@ -111,7 +111,7 @@ def baseline(
         config,
         out,
         initial=initial,
-        scorer=scorers.plain_scorer(gn) if gn else None,
+        scorer=scorers.unaided_scorer(gn) if gn else None,
         scored_by=checkpoint.digest(gn) if gn else "",
     )
     say(out, result, digits=".3f")

@@ -67,7 +67,7 @@ class _Ray(types.ModuleType):
 def ray(monkeypatch: pytest.MonkeyPatch) -> _Ray:
     stand_in = _Ray()
     monkeypatch.setitem(sys.modules, "ray", stand_in)
-    monkeypatch.setattr(launch, "PAUSE", 0.0)
+    monkeypatch.setattr(launch, "RETRY_PAUSE", 0.0)
     return stand_in
 
 

@@ -23,7 +23,7 @@ def scores() -> dict[str, Any]:
     builtin = pathlib.Path("builtin")
     gn: Any = checkpoint.load_network(builtin, network="grasp")
     predictor = predictors.load_predictor(builtin)
-    scorer = scorers.plain_scorer(gn)
+    scorer = scorers.unaided_scorer(gn)
     fast = scorers.grasp_summary(gn)
 
     def decide(seen: Observation, quick: bool) -> Decision:
@@ -58,14 +58,14 @@ def test_rough_means_rank_nearly_as_whole_images_do(settled: Any, scores: dict[s
     others = np.repeat(now[None], 8, 0)
     for k in range(8):  # a block of one colour and height at different places
         others[k, 20 + 20 * k : 45 + 20 * k, 30:80] = [0.5, 0.2, 0.2, 0.04]
-    whole, _ = planner.summarize_whole(scorers.plain_scorer(scores["gn"]))(now, others, np.ones(8, bool))
+    whole, _ = planner.summarize_whole(scorers.unaided_scorer(scores["gn"]))(now, others, np.ones(8, bool))
     whole = whole[1:]
     before = jax.jit(lambda image: partial_scoring.scores_now(scores["gn"], image))(now)
 
     def roughly(images: Any) -> Any:
         every = np.ones(8, bool)
         look = lambda turns: partial_scoring.rough_means(scores["gn"], now, before, images, every, turns=turns)  # noqa: E731
-        return np.asarray(jax.jit(lambda: jnp.stack([look(turns) for turns in partial_scoring.LOOK_TURNS]))())
+        return np.asarray(jax.jit(lambda: jnp.stack([look(turns) for turns in partial_scoring.PASS_TURNS]))())
 
     rough = roughly(others)
     change = np.asarray(whole) - np.asarray(whole).min()

@@ -23,7 +23,7 @@ def test_no_neighbour_changes_a_bit(engine: Any) -> None:
         scene, each = structs.take(items.scene, rows), structs.take(grasps, rows)
         return primitives.grasp(engine, scene, items.poses[rows], each)[0]
 
-    apart = grouped.apart(engine)
+    apart = grouped.group_by_object_count(engine)
     together = grasped(apart, np.arange(16))
     for count in (2, 3):
         rows = np.flatnonzero(counts == count)
@@ -35,4 +35,4 @@ def test_no_neighbour_changes_a_bit(engine: Any) -> None:
 
 def test_engines_of_other_kinds_are_left_alone() -> None:
     mjx = make_engine("mjx")
-    assert grouped.apart(mjx) is mjx
+    assert grouped.group_by_object_count(mjx) is mjx

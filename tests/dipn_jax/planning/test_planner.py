@@ -131,12 +131,12 @@ def test_the_action_of_the_higher_value_is_chosen(seen: Observation) -> None:
     def valued(value: float) -> Any:
         return lambda images: jnp.full((images.shape[0], 16, 224, 224), value).at[:, 2, 112, 30].add(0.1)
 
-    decision = planner.decide_by_value(seen, valued(0.7), valued(0.5), distance=0.1)
+    decision = planner.decide_without_imagining(seen, valued(0.7), valued(0.5), distance=0.1)
     assert decision.is_push and decision.push.distance == np.float32(0.1)
     possible = fingers.pushable(seen.height)
     assert possible[tuple(candidates.push_index(decision.push))]
-    assert not planner.decide_by_value(seen, valued(0.7), valued(0.5), grasp_above=0.4, distance=0.1).is_push
-    assert not planner.decide_by_value(seen, valued(0.4), valued(0.5), distance=0.1).is_push
+    assert not planner.decide_without_imagining(seen, valued(0.7), valued(0.5), grasp_above=0.4, distance=0.1).is_push
+    assert not planner.decide_without_imagining(seen, valued(0.4), valued(0.5), distance=0.1).is_push
     assert decision.grasp_pixel.tolist() == [2, 112, 30]
 
 
@@ -145,7 +145,7 @@ def test_a_grasp_is_chosen_by_one_value_and_compared_by_another(seen: Observatio
         return lambda images: jnp.full((images.shape[0], 16, 224, 224), value).at[:, 2, 112, 30].add(peak)
 
     def decide(push: float, **options: Any) -> Any:
-        return planner.decide_by_value(
+        return planner.decide_without_imagining(
             seen, valued(push), valued(0.1, 0.2), network_scores=valued(0.5, 0.1), distance=0.1, **options
         )
 
@@ -170,5 +170,5 @@ def test_the_highest_of_nearly_equal_grasps_is_made(seen: Observation) -> None:
         decision = _decide(seen, static, scores, top_margin=margin)
         assert tuple(decision.grasp_pixel.tolist()) == pixel and not decision.is_push
         np.testing.assert_allclose(decision.grasp_score, score, rtol=1e-6)
-        by_value = planner.decide_by_value(seen, scores, scores, distance=0.1, top_margin=margin)
+        by_value = planner.decide_without_imagining(seen, scores, scores, distance=0.1, top_margin=margin)
         assert tuple(by_value.grasp_pixel.tolist()) == pixel

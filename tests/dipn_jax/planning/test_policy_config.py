@@ -30,4 +30,4 @@ def test_what_no_method_can_decide_by_is_one_line(entries: dict[str, Any], says:
 
 def test_distances_as_commands_give_them_are_accepted() -> None:
     config = PolicyConfig(candidates=np.int64(10), distances=tuple(np.arange(3, 13) * 0.01))
-    np.testing.assert_allclose(config.spread(), np.arange(3, 13) * 0.01, rtol=1e-6)
+    np.testing.assert_allclose(config.candidate_distances(), np.arange(3, 13) * 0.01, rtol=1e-6)

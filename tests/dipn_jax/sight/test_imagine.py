@@ -71,5 +71,5 @@ def test_the_higher_object_hides_the_lower() -> None:
 
 def test_move_toward_finds_the_first_object() -> None:
     label = jnp.full((224, 224), ABSENT).at[105:120, 120:130].set(1).at[105:120, 140:150].set(0)
-    assert imagine.move_toward(label, jnp.zeros(2), jnp.float32(0.0)) == 1
-    assert imagine.move_toward(label, jnp.zeros(2), jnp.float32(np.pi)) == ABSENT
+    assert imagine.first_object_hit(label, jnp.zeros(2), jnp.float32(0.0)) == 1
+    assert imagine.first_object_hit(label, jnp.zeros(2), jnp.float32(np.pi)) == ABSENT

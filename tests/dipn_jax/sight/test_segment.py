@@ -87,7 +87,7 @@ def test_found_masks_take_the_numbers_of_their_objects() -> None:
     height, color = _boxes((10, 30, 10, 30, 0.05, 0.9), (50, 100, 50, 100, 0.05, 0.4), (150, 180, 150, 180, 0.05, 0.9))
     true = np.full((224, 224), ABSENT)
     true[10:30, 10:30], true[50:100, 50:100] = 2, 0  # the third box belongs to nothing
-    label, known = segment.find(height, color, true, slots=3)
+    label, known = segment.segment_as(height, color, true, slots=3)
     assert known.tolist() == [True, False, True]
     assert (label[15, 15], label[75, 75], label[165, 165]) == (2, 0, 1)
 

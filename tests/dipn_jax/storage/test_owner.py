@@ -90,7 +90,7 @@ def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.P
     def left() -> set[str]:
         return {p.name for p in (*tmp_path.iterdir(), *steps.iterdir()) if p != steps}
 
-    temporary.sweep(tmp_path, shared=True)
+    temporary.delete_leftovers(tmp_path, shared=True)
     assert {name for name in left() if name.startswith(".partial")} == {
         f".partial.npz.{living}.tmp",
         ".partial.npz.elsewher-1-0a1b2c3d.tmp",
@@ -98,7 +98,7 @@ def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.P
     with owner.owned(tmp_path):
         pass
     assert left() == {".mine.tmp", f".00000003.{living}.tmp", f".partial.npz.{living}.tmp"}
-    assert temporary.beside(tmp_path / "a").name.startswith(f".a.{host}-{os.getpid()}-")
+    assert temporary.temporary_path(tmp_path / "a").name.startswith(f".a.{host}-{os.getpid()}-")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[1]", "{", "\x00", '{"pid": "x"}'])

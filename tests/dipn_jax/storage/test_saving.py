@@ -132,11 +132,11 @@ def test_a_save_that_fails_prints_nothing_of_closed_event_loops_and_all_else(mon
     def report(text: str) -> None:
         sys.unraisablehook(types.SimpleNamespace(exc_value=RuntimeError(text)))  # type: ignore[arg-type]
 
-    with quiet.failing():
+    with quiet.failed_saves():
         report("Event loop is closed")
     report("Event loop is closed")
     assert printed == ["Event loop is closed"], "a save that succeeds leaves things as they were"
-    with pytest.raises(ValueError, match="full"), quiet.failing():
+    with pytest.raises(ValueError, match="full"), quiet.failed_saves():
         raise ValueError("full")
     report("Event loop is closed")
     report("something else")
@@ -157,12 +157,12 @@ def test_writes_that_nobody_waits_for_are_not_reported_after_a_save_that_failed(
 
     gc.collect()  # what tests before this one have forgotten
     caplog.clear()
-    with pytest.raises(ValueError, match="full"), quiet.failing():
+    with pytest.raises(ValueError, match="full"), quiet.failed_saves():
         raise ValueError("full")
     asyncio.run(forget())
     logging.getLogger("asyncio").error("something else")
     assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == ["something else"]
-    with quiet.failing():
+    with quiet.failed_saves():
         pass
     asyncio.run(forget())
     assert "never retrieved" in caplog.records[-1].getMessage()

@@ -99,7 +99,7 @@ def test_a_method_without_its_network_is_refused(engine: Any, runs: dict[str, pa
 
 def test_each_candidate_takes_one_of_several_distances() -> None:
     config = PolicyConfig(candidates=5, distances=(0.03, 0.06))
-    np.testing.assert_allclose(config.spread(), [0.03, 0.06, 0.03, 0.06, 0.03])
+    np.testing.assert_allclose(config.candidate_distances(), [0.03, 0.06, 0.03, 0.06, 0.03])
 
 
 def test_tables_are_a_case_file_or_random() -> None:

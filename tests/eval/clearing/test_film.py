@@ -75,4 +75,4 @@ def test_no_name_in_a_list_of_episodes_leads_out_of_its_folder(name: str, cleare
     files.write_json(folder / "episodes.json", [entries[0] | {"file": name}])
     one = comparison.Cleared(folder)
     with pytest.raises(UserError, match="is no file inside"):
-        comparison.course(one, np.ones(1))
+        comparison.share_left(one, np.ones(1))

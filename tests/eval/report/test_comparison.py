@@ -29,13 +29,13 @@ def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib
 @pytest.mark.slow
 def test_the_course_of_clearing_is_the_share_left_after_each_action(cleared: Any) -> None:
     tables, out = cleared
-    shares = comparison.course(comparison.Cleared(out), np.array([0.0, 3.0]))
+    shares = comparison.share_left(comparison.Cleared(out), np.array([0.0, 3.0]))
     left = [(table.scene.shape >= 0).sum() / table.objects for table in tables]
     np.testing.assert_allclose(shares, [1.0, np.mean(left)])
     after = [(t.film[min(t.objects, len(t.film) - 1)]["shape"] >= 0).sum() / t.objects for t in tables]
     late = [(t.scene.shape >= 0).sum() / t.objects for t in tables]
     wanted = np.mean([a if len(t.film) > t.objects else b for t, a, b in zip(tables, after, late, strict=True)])
-    np.testing.assert_allclose(comparison.course(comparison.Cleared(out), np.ones(1)), wanted)
+    np.testing.assert_allclose(comparison.share_left(comparison.Cleared(out), np.ones(1)), wanted)
 
 
 def test_metrics_that_are_no_numbers_are_one_line(tmp_path: pathlib.Path) -> None:

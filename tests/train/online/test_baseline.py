@@ -57,7 +57,7 @@ def test_dqns_push_is_rewarded_for_a_better_grasp_and_for_uncovering() -> None:
 def test_a_target_has_the_value_of_the_best_next_action_but_no_impossible_one() -> None:
     then = _look(_heights(*[1000] * 4), 0.8)
     then = then.replace(push_value=np.array([0.6, 1.2, 5.0, 1.0]))
-    target = acting.with_future(np.array([1.0, 0.5, 0.5, 0.0]), then, np.array([True, True, True, False]))
+    target = acting.q_targets(np.array([1.0, 0.5, 0.5, 0.0]), then, np.array([True, True, True, False]))
     np.testing.assert_allclose(target, [1.4, 1.1, 1.5, 0.0])
 
 
@@ -175,8 +175,8 @@ def test_an_interrupted_run_continues_to_the_same_end(
     config = baseline.BaselineConfig(method, actions=8, tables=4, updates=2, batch=4)
     gn: dict[str, Any] = {"scorer": _flat_scores, "scored_by": "one"} if method == "dqn" else {}
     futures: list[int] = []
-    with_future = acting.with_future
-    monkeypatch.setattr(acting, "with_future", lambda *args: futures.append(1) or with_future(*args))
+    q_targets = acting.q_targets
+    monkeypatch.setattr(acting, "q_targets", lambda *args: futures.append(1) or q_targets(*args))
     whole = baseline.learn(engine, CONFIG, config, tmp_path / "a", **gn)
     assert bool(futures) == (method != "rea"), "values count what comes next, chances do not"
     save = resume.Partial.save

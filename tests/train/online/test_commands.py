@@ -19,7 +19,7 @@ from dipn_jax.system import files
 from dipn_jax.world import scenes
 
 PARTS = {"vpg": (("push", "grasp"), "value"), "rea": (("grasp",), "chance"), "dqn": (("push",), "value")}
-STILL = {"actions": 4, "tables": 4, "updates": 1, "batch": 4, "learning_rate": 1e-9}
+ALMOST_NO_LEARNING = {"actions": 4, "tables": 4, "updates": 1, "batch": 4, "learning_rate": 1e-9}
 
 
 def saved(run: pathlib.Path, method: str, width: int = 8) -> nnx.Module:
@@ -35,7 +35,7 @@ def test_a_compared_method_starts_from_a_run_of_it(engine: Any, tmp_path: pathli
     saved(tmp_path / "begun", "rea")
     initial: Any = checkpoint.load_network(tmp_path / "begun", network="vpg")
     before = checkpoint.digest(initial)
-    some, config = scenes.fixed_count(3, spread=0.2), baseline.BaselineConfig("rea", **STILL)  # type: ignore[arg-type]
+    some, config = scenes.fixed_count(3, spread=0.2), baseline.BaselineConfig("rea", **ALMOST_NO_LEARNING)  # type: ignore[arg-type]
     baseline.learn(engine, some, config, tmp_path / "run", initial=initial)
     assert files.read_json(tmp_path / "run" / "config.json")["initial_weights"] == before
     assert checkpoint.digest(initial) == before, "what is given is left as it is"

@@ -57,7 +57,7 @@ def decide_by_values(
 
     def decide(_: Array, seen: Observation, missed: Array, rule: Rule, distances: Array) -> Decision:
         above = rule.grasp_above if grasp_at_once else jnp.inf
-        return planner.decide_by_value(
+        return planner.decide_without_imagining(
             seen,
             push_scorer,
             scorer,
