@@ -65,7 +65,7 @@ def faces_down(poses: Float[np.ndarray, "B N 7"]) -> Int[np.ndarray, "B N"]:
 
 
 def alike(drops: tuple[Rollout, Rollout], shapes: tuple[Int[Array, "B N"], Int[Array, "B N"]]) -> dict[str, float]:
-    """Return p-values that objects of two sets of drops rest as if they were of one distribution.
+    """Return p-values of tests that two sets of drops come to rest in the same way.
 
     Kolmogorov and Smirnov's test of two samples for the mean height and the mean distance from the middle of each
     scene's objects; the chi-squared test for which side of an object of each class is down.

@@ -104,7 +104,7 @@ class Record:
         files.write_json(self.path, self.kept)
 
     def table(self, stages: dict[str, Stage]) -> str:
-        """Return a line a stage: its main figure, its goal, how it ended, seconds, and those of them for compiling."""
+        """Return one line per stage: main figure, goal, how it ended, seconds, and the seconds spent compiling."""
         lines = [f"{'stage':32} {'value':>9} {'goal':>8} {'s':>6} {'compiling':>9}  ended"]
         for name, stage in stages.items():
             entry = self.kept["stages"].get(name, {"state": "not measured", "seconds": 0.0, "compiling": 0.0})

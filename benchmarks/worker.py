@@ -24,7 +24,7 @@ FLOAT32 = "float32"
 
 
 def serve(step: Step, parameters: int) -> None:
-    """For each number on standard input, print the seconds of as many steps; at its end, parameters and memory."""
+    """Read numbers of steps from standard input and print the seconds each takes; at the end parameters and memory."""
     for line in sys.stdin:
         begun = time.perf_counter()
         for _ in range(int(line)):

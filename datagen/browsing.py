@@ -21,7 +21,7 @@ from dipn_jax.system import addresses, files, typed
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
-MOVED = 0.001
+SHOWN_AS_MOVED_DISTANCE = 0.001
 """Metres by which an object is farther than before that counts as moved."""
 STEP = 2
 """Every second pixel of a view is shown."""
@@ -80,7 +80,7 @@ def _tags(episodes: Any) -> list[dict[str, list[str]]]:
         tags = {"fault": names, "shape": [shapes.CLASSES[one] for one in classes]}
         if hasattr(episodes, "push"):
             before, after = episodes.poses[row, 0, :, :3], episodes.after[row, :, :3]
-            number = int((np.linalg.norm(after - before, axis=-1)[present[row]] > MOVED).sum())
+            number = int((np.linalg.norm(after - before, axis=-1)[present[row]] > SHOWN_AS_MOVED_DISTANCE).sum())
             tags["distance"] = [f"{100 * float(episodes.push.distance[row]):.3g}cm"]
             tags["outcome"] = [f"{number}-moved"]
         if hasattr(episodes, "grasp"):

@@ -27,7 +27,8 @@ def check_world(
       engines: which of native_awake, native_1ms, native_3.3ms, native_5ms, mjx, mjx_warp and warp are held against
         native.
       scenes_: scenes with a push and a grasp each.
-      few: scenes for warp, which makes about 60 steps a second on a CPU, and drops for mjx (on a GPU, for warp).
+      few: number of scenes for MuJoCo Warp and of drops for MJX, the engines that are slow on a CPU (on a GPU: of
+        drops for Warp, too).
       tries: grasps of every catalogue item.
       seed: random seed of everything.
       threads: threads of the native engine; one per core by default.

@@ -158,8 +158,8 @@ def grasp(
       actions: different grasps tried on each settled scene.
       shard_size: episodes in a file.
       grasp_net: run of dipn-train, or builtin; none: all grasps are random.
-      guided: share of grasps that it scores high, 0.5 unless given.
-      unsure: share of grasps that it is unsure of, 0.25 unless given.
+      guided: share of grasps that the network scores high, 0 to 1; 0.5 unless given.
+      unsure: share of grasps that the network is unsure of, 0 to 1; 0.25 unless given.
       ranges: the ranges that random objects are drawn from.
       work: engine and share of the work.
     """
@@ -183,7 +183,7 @@ def grasp(
     if grasp_net is None:
         _generate(job, out, work, given)
     else:
-        guided, unsure = (value if given is None else given for given, value in ((guided, 0.5), (unsure, 0.25)))
+        guided, unsure = 0.5 if guided is None else guided, 0.25 if unsure is None else unsure
         _generate_guided(job, out, work, given, guided=guided, unsure=unsure)
 
 

@@ -86,7 +86,7 @@ class Job:
 
     def shards(self) -> int:
         """Return how many shards the data set has."""
-        return -(-self.episodes // self.shard_size)
+        return accounting.Asked(self.episodes, self.shard_size).shards()
 
     def describe(self) -> dict[str, Any]:
         """Return the job as it is written beside the shards; with the kind of device if batches depend on it."""
@@ -96,7 +96,7 @@ class Job:
 
     def size(self, index: int) -> int:
         """Return the number of episodes of shard `index`."""
-        return min(self.shard_size, self.episodes - index * self.shard_size)
+        return accounting.Asked(self.episodes, self.shard_size).size(index)
 
 
 Elsewhere = Callable[[Job, Sequence[int], pathlib.Path], Generator[tuple[str, dict[str, Any]], None, None]]

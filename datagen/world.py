@@ -172,7 +172,7 @@ def _depths(made: Trial, poses: np.ndarray, gripper: np.ndarray) -> np.ndarray:
 
 
 def sweep(engine: Engine, made: Trial, poses: np.ndarray) -> Metrics:
-    """Measure `sweep/{k}cm/...`: separate pushes, ended by a retreat, against the poses at `k` cm of a longer one."""
+    """Measure how far pushes of `k` cm end from the poses at `k` cm of a longer push, as `sweep/{k}cm/...`."""
     found = {}
     for centimetres in (3, 5, 7):
         short = made.pushes.replace(distance=np.full(len(poses), centimetres * 0.01, np.float32))
@@ -196,7 +196,7 @@ def _apart(name: str, found: np.ndarray, wanted: np.ndarray, poses: np.ndarray) 
 
 
 def agreement(name: str, engine: Engine, made: Trial, poses: np.ndarray, held: np.ndarray) -> Metrics:
-    """Measure `agreement/{engine}/...` with the reference's `poses [B, 12, N, 7]` and `held [B, A, N]`."""
+    """Measure how far an engine's pushes and grasps are from the reference's, as `agreement/{engine}/...`."""
     rollout = primitives.push(engine, made.items.scene, made.items.poses, made.pushes)
     found: Metrics = {}
     for centimetres in (1, 5, 10):

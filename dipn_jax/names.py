@@ -1,4 +1,4 @@
-"""Names of engines, methods and aids, options of the commands.
+"""The names of engines, methods and aids, which are values of options.
 
 Importing this imports no JAX, so `--help` answers at once.
 """

@@ -1,1 +1,1 @@
-"""Predictions, grasps, whole policies and the report: `dipn-eval`."""
+"""Evaluate predictions, grasps and whole policies, and write the report: `dipn-eval`."""

@@ -28,7 +28,7 @@ after = dipn_jax.render(scene[0], np.asarray(rollout.poses)[0, -1])
 
 
 def iou(one: np.ndarray, other: np.ndarray) -> float:
-    """Mean over the objects of how far their masks in two label maps overlap."""
+    """Return the mean IoU of the objects' masks in two label maps."""
     pairs = [(one == slot, other == slot) for slot in range(5)]
     return float(np.mean([(a & b).sum() / (a | b).sum() for a, b in pairs]))
 

@@ -16,7 +16,7 @@ push = pushes[0]
 
 @jax.jit
 def travel(distance: jax.Array) -> jax.Array:
-    """Metres by which each object would move: `[N]`."""
+    """Return by how many metres each object would move, `[N]`."""
     motion = predict(observation, push.replace(distance=distance)[None])
     return jnp.linalg.norm(motion[0, :, :2], axis=-1)
 

@@ -185,8 +185,11 @@ def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
     if (folder / "metrics.json").exists():
         found = files.read_json(folder / "metrics.json")
         sweep = {key: value for key, value in found.items() if key.startswith("sweep/")}
-        files.write_json(docs / "sweep.json", sweep)
+        run = next(run for run in listed if run.out == folder)
+        files.write_json(docs / "sweep.json", sweep | {pages.MADE: pages.made([run])[run.name]})
         shutil.copy(folder / "sweep.png", docs / "sweep.png")
+    for name, kept in (("sweep", "sweep"), ("push_or_grasp", "push-or-grasp")):
+        values[pages.MADE][name] = files.read_json(docs / f"{kept}.json")[pages.MADE]
     tables = [clearing_tables.swept(files.read_json(docs / "sweep.json"))]
     pages.write("clearing", values, tables, docs=docs, section=section)
 

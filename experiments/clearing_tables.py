@@ -254,5 +254,5 @@ def swept(values: dict[str, Any]) -> str:
         name = each if error is None else f"{100 * float(each):.0f} cm"
         cells = [_cell(values, f"{at}/{key}") for key in sweeping.SHOWN]
         rows.append([name, "-" if error is None else f"{error:.3f}", *cells, str(values[f"{at}/pushes"])])
-    head = ["push", "error, moved objects", "completion", "grasp success", "efficiency", "pushes"]
+    head = ["push", "error, moved objects", "completion", "objects per grasp", "objects per action", "pushes"]
     return markdown.table(head, rows)

@@ -1,4 +1,4 @@
-"""Give every parser that a user's files reach mutations of a valid file, and count what comes of it.
+"""Feed mutated files to every parser that reads a user's files, and count the outcomes.
 
     python -m experiments.fuzz                        # 10,000 inputs to each parser
     python -m experiments.fuzz --only shard --inputs 500
@@ -49,7 +49,7 @@ class Count:
 
 
 def outcome(parser: Parser, folder: pathlib.Path) -> tuple[str, str]:
-    """Return what comes of the file that stands in the folder: one of OUTCOMES, and what was said."""
+    """Return the outcome of parsing the folder's file (one of OUTCOMES), and the message."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), warnings.catch_warnings():

@@ -25,7 +25,6 @@ from mujoco import mjx
 from mujoco.mjx._src import solver
 
 from dipn_jax.commands import markdown
-from dipn_jax.system import files, machine
 from experiments import pages
 
 BOXES = 6
@@ -114,8 +113,7 @@ def table(values: dict[str, Any]) -> str:
 
 def write_page(values: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
     """Write what `measure` returned, with its table and box, to the page in the folder `docs`."""
-    here = {"commit": machine.commit(), "processor": machine.processor(), "cores": machine.cores()}
-    made = {"piles": {"made_by": [here], "seed": SEED, "versions": files.package_versions()}}
+    made = {"piles": pages.made_here(SEED)}
     pages.write("mjx-elliptic-cone", values | {pages.MADE: made}, [table(values)], docs=docs)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
-from dipn_jax.system import files
+from dipn_jax.system import files, machine
 from experiments import runs
 from experiments.runs import NOT_RECORDED, Run
 
@@ -39,6 +39,12 @@ def made(listed: Sequence[Run]) -> dict[str, Any]:
     facts = ("made_by", "seed", "versions")
     stamps = {run.name: runs.read_stamp(run) for run in listed}
     return {name: {key: stamp[key] for key in facts if key in stamp} for name, stamp in stamps.items()}
+
+
+def made_here(seed: int | None) -> dict[str, Any]:
+    """Return what `made` says of a run: that it was made by this process, with this seed."""
+    here = {"commit": machine.commit(), "processor": machine.processor(), "cores": machine.cores()}
+    return {"made_by": [here], "seed": seed, "versions": files.package_versions()}
 
 
 def box(values: dict[str, Any]) -> str:

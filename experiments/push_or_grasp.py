@@ -4,7 +4,8 @@
 
 Ten minutes on 2 cores. The states are the first of each table on which no grasp scores over 0.7, of tables that only
 set the constants of `dipn_jax/planning/expected_misses.py`: the ten hard ones at a seed of their own, and packed rows
-of large blocks. Writes `states.json`, and with `--page` the table of docs/clearing.md and docs/push-or-grasp.json.
+of large blocks. Writes `states.json`, and with `--page` docs/push-or-grasp.json and its table in docs/clearing.md
+(the box of that page is written by `python -m experiments.clearing --page`).
 """
 
 from __future__ import annotations
@@ -127,9 +128,9 @@ LIMITS = (0.0, 1.0, 1.5, 2.0, 2.2, 2.4, 2.6, 3.0)
 """Shortfalls from which on pushes are made, in the table."""
 
 
-def table(rows: dict[str, list[dict[str, Any]]]) -> str:
+def table(states: dict[str, Any]) -> str:
     """Return a table of what pushes save in all, by the shortfall or the rise of the mean from which they are made."""
-    lines = []
+    rows, lines = {name: states[name] for name in KINDS}, []
     for limit in LIMITS:
         cells = [_saved([row for row in found if row["shortfall"] > limit]) for found in rows.values()]
         lines.append([f"shortfall over {limit:.1f}", *cells])
@@ -159,8 +160,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not options.page:
             console.require_out(options.out)
             engine = make_engine("native")
-            rows = {name: compare(engine, tables, options.out / name) for name, tables in KINDS.items()}
-            files.write_json(path, rows)
+            rows: dict[str, Any] = {name: compare(engine, tables, options.out / name) for name, tables in KINDS.items()}
+            files.write_json(path, rows | {pages.MADE: pages.made_here(SEED)})
             console.say(table(rows))
             return 0
         rows = files.read_json(path)

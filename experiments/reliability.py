@@ -43,7 +43,7 @@ def section(values: dict[str, Any]) -> str:
 
 
 def box(values: dict[str, Any]) -> str:
-    """Return the page's box as Markdown: with what each count was made, from its JSON."""
+    """Return the page's box as Markdown: machine, commit and seed of each count, from its JSON."""
     fuzzed: dict[str, list[str]] = {}
     for parser, found in values.get("fuzz", {}).items():
         about = f"commit {found['commit']}, seed {found['seed']}"

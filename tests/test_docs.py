@@ -31,6 +31,12 @@ SLOW = ("other_tools.md", "your_method.md")
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
 FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(dipn-(?:datagen|train|eval) [^`]+)`")
+OPTION = re.compile(r"`(--[a-z][a-z0-9_-]*)[^`]*`")
+"""An option that stands in a sentence without its command."""
+FOREIGN = {"--cpus-per-task", "--dependency", "--gpus-per-task", "--requeue", "--xla_gpu_enable_command_buffer"}
+"""Options of other programs, of which pages speak."""
+OURS = {"--dry-run", "--list", "--only", "--page", "--scale", "--toy", "--out", "--seed"}
+"""Options of experiments and benchmarks."""
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
@@ -117,6 +123,14 @@ def test_commands_and_options_within_sentences_exist(page: pathlib.Path) -> None
             assert name in known or name.startswith("-"), words
         for option in (word for word in rest if word.startswith("--") and command in known):
             assert re.search(rf"{option}\b", help_of(program, command)), f"{option} of {' '.join(words)}"
+
+
+@each_page
+def test_options_within_sentences_are_options_of_some_command(page: pathlib.Path) -> None:
+    commands = [(name, cmd) for name in runs.PROGRAMS for cmd in importlib.import_module(runs.PROGRAMS[name]).COMMANDS]
+    for option in OPTION.findall(FENCE.sub("", page.read_text())):
+        known = option in FOREIGN | OURS or any(re.search(rf"{option}\b", help_of(*command)) for command in commands)
+        assert known, f"{option}: no command has it"
 
 
 def test_the_readme_fits_on_a_screen_and_its_table_is_the_kept_one() -> None:

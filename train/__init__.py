@@ -1,1 +1,1 @@
-"""One short loop and what it trains: `dipn-train`."""
+"""Train networks: `dipn-train`."""

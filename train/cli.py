@@ -110,7 +110,7 @@ def push(
       init: run to start from, or builtin; its architecture is used.
       preset: architecture, without --init.
       limit: learn from this many of the first episodes only; what is held out stays the same.
-      centimetres: push distances learnt.
+      centimetres: push distances that are learnt, whole centimetres from 1 to 10.
       without: leave out scenes with an object of these classes, to see how well unseen shapes are predicted.
       masks: true: the simulator's; found: cut out of the rendered image by colour and height.
       config: optimizer and schedule.

@@ -33,8 +33,8 @@ class TrainConfig:
     Attributes:
       steps: Optimizer steps.
       batch: Examples in a step.
-      learning_rate: The highest learning rate of the run.
-      weight_decay: Weight decay.
+      learning_rate: highest learning rate of the run; adamw decays from it by a cosine.
+      weight_decay: factor of the weights in the decay of each step, 0 to 1.
       optimizer: adamw with cosine decay; sgd with momentum 0.9 and a constant rate; or published, as DIPN was: sgd
         whose rate rises in the first epoch and falls to a tenth after each third of the steps.
       seed: Seed of weights, order and augmentation.
@@ -173,7 +173,7 @@ class OnlineConfig:
     learning_rate: float = 5e-4
     """Learning rate, constant."""
     weight_decay: float = 1e-4
-    """Weight decay."""
+    """Factor of the weights in the decay of each step, 0 to 1."""
     seed: int = 0
     """Seed of scenes, weights, order and augmentation."""
     pretrained: tyro.conf.Suppress[bool] = False
@@ -199,6 +199,6 @@ class BaselineConfig:
     learning_rate: float = 5e-4
     """Learning rate, constant."""
     weight_decay: float = 1e-4
-    """Weight decay."""
+    """Factor of the weights in the decay of each step, 0 to 1."""
     seed: int = 0
     """Seed of scenes, weights, order and exploration."""

@@ -38,19 +38,19 @@ class OneDevice:
         """Return those examples of a batch `[B]` that this process fetches."""
         return batch
 
-    def share(self, examples: Any) -> Any:
-        """Return a batch, of which this process gives the examples of `rows`, as it is given to a step."""
+    def shard_batch(self, examples: Any) -> Any:
+        """Return the batch in the form that a step takes; this process contributes the examples of `rows`."""
         return examples
 
-    def everywhere(self, tree: Any) -> Any:
-        """Return a pytree of which every device has all."""
+    def replicate(self, tree: Any) -> Any:
+        """Copy a pytree to every device."""
         return tree
 
-    def here(self, tree: Any) -> Any:
-        """Return a pytree that is the same everywhere as arrays of one device of this process."""
+    def local_copy(self, tree: Any) -> Any:
+        """Return this process's copy of a pytree that is the same on every device."""
         return tree
 
-    def any_says(self, said: bool, step: int) -> bool:
+    def any_process_stops(self, said: bool, step: int) -> bool:
         """Return whether any process wants to stop; all call it after each step and agree every SYNC_EVERY steps."""
         return said
 
@@ -83,19 +83,19 @@ class Shared(OneDevice):
         """See `OneDevice`."""
         return np.array_split(batch, jax.process_count())[jax.process_index()]
 
-    def share(self, examples: Any) -> Any:
+    def shard_batch(self, examples: Any) -> Any:
         """See `OneDevice`."""
         return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(self._each, np.asarray(leaf)), examples)
 
-    def everywhere(self, tree: Any) -> Any:
+    def replicate(self, tree: Any) -> Any:
         """See `OneDevice`."""
         return jax.device_put(tree, self._all)
 
-    def here(self, tree: Any) -> Any:
+    def local_copy(self, tree: Any) -> Any:
         """See `OneDevice`."""
         return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
-    def any_says(self, said: bool, step: int) -> bool:
+    def any_process_stops(self, said: bool, step: int) -> bool:
         """See `OneDevice`."""
         if jax.process_count() == 1:
             return said

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Float, Int
 
 from dipn_jax import batching, geometry, structs
 from dipn_jax.networks import grasp, losses
@@ -114,10 +115,10 @@ class PretrainTask:
 class Window(Pytree):
     """One executed action as an example; the closing axis of a grasp, or a push, lies along the columns."""
 
-    height: Array  # [W, W] float16 metres; the action is at the centre of pixel (W / 2, W / 2)
-    label: Array  # [W, W] int8: object slot, ABSENT on the table
-    color: Array  # [N, 3] in [0, 1], of the objects
-    target: Array  # [] float32: 1 if a grasp held, 0 if not; or another measure of the result
+    height: Float[Array, "*b W W"]  # float16, metres; the action is at the centre of pixel (W / 2, W / 2)
+    label: Int[Array, "*b W W"]  # int8: object slot, ABSENT on the table
+    color: Float[Array, "*b N 3"]  # in [0, 1], of the objects
+    target: Float[Array, "*b"]  # float32: 1 if a grasp held, 0 if not; or another measure of the result
 
 
 @functools.partial(jax.jit, static_argnames="pixels")
@@ -141,7 +142,7 @@ def windows(episodes: GraspEpisode, *, pixels: int) -> Window:
 
 
 def executed(key: jax.Array, model: nnx.Module, batch: Window, *, mirrors: tuple[int, ...]) -> jax.Array:
-    """Return what a network says of executed actions `[B]`, each shifted, mirrored or not, with objects in new colours.
+    """Return a network's outputs at executed actions `[B]`, with images shifted, mirrored and recoloured at random.
 
     Args:
       key: random key.

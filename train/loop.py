@@ -168,7 +168,7 @@ def _fit(
     where.wait("claimed")
     moments, begin, best = _resume(out, model, optimizer)
     graph, *state = _split(model)
-    params, rest, moments = where.everywhere((*state, moments))
+    params, rest, moments = where.replicate((*state, moments))
     batches = example_order.batches(task.parts, config)
     step_fn = make_step(task, graph, optimizer, compute=compute)
     curve = log.Log(out, begin, batch=config.batch, writes=where.leads)
@@ -177,8 +177,8 @@ def _fit(
     watch = finite.Watch(config.learning_rate, lambda k: np.asarray(batches[k]), "the last finite checkpoint is kept")
 
     def save(step: int) -> None:
-        here = where.here((params, rest))
-        parts = {"model": nnx.state(nnx.merge(graph, *here)), "train": where.here(moments)}
+        here = where.local_copy((params, rest))
+        parts = {"model": nnx.state(nnx.merge(graph, *here)), "train": where.local_copy(moments)}
         about = {"seed": config.seed, "data": task.fingerprint, "examples": task.examples, **latest, **best}
         if where.leads:
             saver.save(step, parts, extra=about)
@@ -190,23 +190,23 @@ def _fit(
     with progress, Interruption() as interruption, saver, profiled, ahead:
         while step < config.steps:
             profiled.see(step)
-            batch = where.share(ahead.take())
+            batch = where.shard_batch(ahead.take())
             params, rest, moments, loss = step_fn(params, rest, moments, batch, jax.random.fold_in(key, step))
-            watch.see(step, where.here(loss))
+            watch.see(step, where.local_copy(loss))
             step += 1
             if step == begin + 1:
                 curve.resume(step)  # it has been compiled
-            stopping = where.any_says(interruption.requested, step)
+            stopping = where.any_process_stops(interruption.requested, step)
             evaluating = step % config.eval_every == 0 or step == config.steps
             due = step % config.save_every == 0 or step == config.steps or stopping
             if evaluating or due:
-                watch.check(step, where.here((params, rest, moments)))
+                watch.check(step, where.local_copy((params, rest, moments)))
                 curve.pause(step)
             if evaluating:
-                model = nnx.merge(graph, *where.here((params, rest)))
+                model = nnx.merge(graph, *where.local_copy((params, rest)))
                 model.eval()
-                latest = {"loss": float(where.here(loss)), **task.evaluate(model)}
-                watch.check(step, where.here(params), **latest)
+                latest = {"loss": float(where.local_copy(loss)), **task.evaluate(model)}
+                watch.check(step, where.local_copy(params), **latest)
                 speed = curve.write(step, latest)
                 if not best or latest[BEST_MEASURE] < best["best"]["value"]:
                     best, due = {"best": {"step": step, "measure": BEST_MEASURE, "value": latest[BEST_MEASURE]}}, True
@@ -233,8 +233,8 @@ def _compile(
 ) -> dict[str, float]:
     """Compile a step and return the memory in MB that XLA plans on each device; arguments as of `fit`."""
     graph, *state = _split(initial or checkpoint.build(task.network, task.network_config, seed=config.seed))
-    given = where.everywhere((*state, optimizer.init(state[0])))
-    batch = where.share(task.fetch(where.rows(np.arange(config.batch) % task.size)))
+    given = where.replicate((*state, optimizer.init(state[0])))
+    batch = where.shard_batch(task.fetch(where.rows(np.arange(config.batch) % task.size)))
     step: Any = make_step(task, graph, optimizer, compute=compute)
     planned = step.lower(*given, batch, jax.random.key(0)).compile().memory_analysis()
     sizes = {"arguments": planned.argument_size_in_bytes, "temporary": planned.temp_size_in_bytes}

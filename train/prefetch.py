@@ -8,7 +8,7 @@ from typing import Any, Self
 
 
 class Prefetcher:
-    """The batches of steps that follow one another; it has to be entered (`with`), which starts and ends the thread.
+    """Prepares the batch of the next step in a thread; a context manager that starts and ends the thread.
 
     There is one thread, so that batches are made one after another, and an error is raised at the step of its batch.
     At the end it is waited for; Grain, which can do the rest, does not wait, and examples in files are closed then.

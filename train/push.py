@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Bool, Float
 
 from dipn_jax import geometry, structs
 from dipn_jax.errors import UserError
@@ -31,8 +32,8 @@ class Example(Pytree):
     """One push as an example, at K distances."""
 
     inputs: PushInput
-    target: Array  # [N, K, 3]: pixels, pixels, degrees, push frame
-    taught: Array  # [N, K] bool: the object counts (its mask belongs to a real one), and the push reaches the distance
+    target: Float[Array, "*b N K 3"]  # pixels, pixels, degrees, push frame
+    taught: Bool[Array, "*b N K"]  # the object's mask belongs to a real one, and the push reaches the distance
 
 
 class PushTask:

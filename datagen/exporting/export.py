@@ -101,8 +101,9 @@ def _writer(source: Source, out: pathlib.Path, form: str, images: str) -> Writer
         return lerobot.LeRobot(out, source.slots, images)
     from . import stepped
 
-    of_steps: type[stepped.Hdf5] | type[stepped.Zarr] = stepped.Hdf5 if form == "hdf5" else stepped.Zarr
-    return of_steps(out, source.kind, source.slots, images)
+    if form == "hdf5":
+        return stepped.Hdf5(out, source.kind, images)
+    return stepped.Zarr(out, source.kind, source.slots, images)
 
 
 def _write(writer: Writer, source: Source, images: str) -> None:

@@ -26,7 +26,7 @@ MASKS = {"train": "train", "test": "valid"}
 class Hdf5:
     """One file in robomimic's layout: `data/demo_0/obs/poses`, `data/demo_0/actions`, ..., `mask/train`."""
 
-    def __init__(self, out: pathlib.Path, kind: str, slots: int, images: str) -> None:
+    def __init__(self, out: pathlib.Path, kind: str, images: str) -> None:
         self.out, self.kind, self.path = out, kind, out / "data.hdf5"
         self.step, self.episode = steps.step_columns(kind, images), steps.episode_columns(kind)
 

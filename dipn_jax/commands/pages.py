@@ -14,7 +14,7 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-
 
 
 def escaped(text: str) -> str:
-    """Return a user's text as HTML shows it: what is markup is escaped, and `{`, which marks the places of figures."""
+    """Return a user's text escaped for HTML, `{` included, because `{` marks the places of figures."""
     readable = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     return html.escape(readable).replace("{", "&#123;")
 
@@ -40,7 +40,7 @@ def bars(title: str, counts: Mapping[str, int]) -> str:
 
 
 def picture(png: bytes, alt: str) -> str:
-    """Return an image with its content inside."""
+    """Return a PNG as an HTML image with its bytes inside the page."""
     return f'<img alt="{escaped(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
 
 

@@ -78,7 +78,7 @@ def open_streams() -> None:
 
 
 def print_error(text: str) -> None:
-    """Print a line on standard error, if that can be written to; the exit code says the rest."""
+    """Print a line on standard error; do nothing if it cannot be written to."""
     with contextlib.suppress(OSError):
         print(text, file=sys.stderr, flush=True)
 

@@ -82,7 +82,7 @@ class _Paper(nnx.Module):
 
 
 class _Compact(nnx.Module):
-    """`Stepwise`, read at any distance: one pass predicts the motions at all distances, and all are learnt from."""
+    """`Stepwise`, interpolated to any distance: one pass predicts all distances, and the loss is over all of them."""
 
     def __init__(self, config: DipnConfig, rngs: nnx.Rngs) -> None:
         self.steps = stepwise.Stepwise(config.view, config.width, config.features, config.rounds, rngs)

@@ -166,7 +166,7 @@ def aided_scores(
     squash: Callable[[jax.Array], jax.Array] = nnx.sigmoid,
     lowest: float = 0.0,
 ) -> Float[jax.Array, "16 224 224"]:
-    """Return the scores of all grasps to choose one by, with some of the aids of `names.Aid`.
+    """Return the scores by which a grasp is chosen: the network's, changed by the given aids (`names.Aid`).
 
     mirrors: a mirror image of a grasp is as good as the grasp, and both mirrors map the 16 angles onto themselves, so
     there are four scores of each grasp. The best of a million scores is an overestimate; the least of four makes up

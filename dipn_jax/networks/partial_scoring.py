@@ -109,7 +109,7 @@ def rough_means(
     *,
     turns: tuple[int, ...],
 ) -> Float[jax.Array, " P"]:
-    """Return rough changes, due to rotations `turns`, of the mean score from the present image to each image.
+    """Return estimates, from rotations `turns` alone, of how each image's mean score differs from the present one's.
 
     Args:
       network: GN, `compact`, in evaluation mode.

@@ -63,7 +63,7 @@ def _near(gap: Float[jax.Array, "*b"]) -> Float[jax.Array, "*b"]:
 
 
 class Stepwise(nnx.Module):
-    """Network that advances position, turn and memory of objects by messages that know the gaps between outlines."""
+    """Network that moves objects step by step; objects exchange messages computed from the gaps between outlines."""
 
     def __init__(self, view: View, width: int, features: int, rounds: int, rngs: nnx.Rngs) -> None:
         f = features

@@ -22,6 +22,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 from mujoco.mjx._src import support
 from mujoco.mjx._src.types import ConeType, SolverType
 
@@ -43,31 +44,31 @@ TINY = 1e-12
 
 @flax.struct.dataclass
 class _Problem(Pytree):
-    """Minimize `(a - free)' mass (a - free) / 2` plus what the rows and the cones of `a` pay."""
+    """The problem: minimize `(a - free)' mass (a - free) / 2` plus the costs of the rows and cones."""
 
-    mass: jax.Array  # [V, V]
-    free: jax.Array  # [V] acceleration without constraints
-    force: jax.Array  # [V] mass @ free
-    rows: jax.Array  # [R, V] equalities and limits
-    goal: jax.Array  # [R]
-    weight: jax.Array  # [R]
-    always: jax.Array  # [R] bool: an equality, else one-sided
-    cones: jax.Array  # [C, K, V] normal and tangents of contacts, scaled
-    cone_goal: jax.Array  # [C, K]
-    stiffness: jax.Array  # [C]
-    mu: jax.Array  # [C] slope of the scaled cone
+    mass: Float[jax.Array, "*b V V"]
+    free: Float[jax.Array, "*b V"]  # acceleration without constraints
+    force: Float[jax.Array, "*b V"]  # mass @ free
+    rows: Float[jax.Array, "*b R V"]  # equalities and limits
+    goal: Float[jax.Array, "*b R"]
+    weight: Float[jax.Array, "*b R"]
+    always: Bool[jax.Array, "*b R"]  # an equality, else one-sided
+    cones: Float[jax.Array, "*b C K V"]  # normal and tangents of contacts, scaled
+    cone_goal: Float[jax.Array, "*b C K"]
+    stiffness: Float[jax.Array, "*b C"]
+    mu: Float[jax.Array, "*b C"]  # slope of the scaled cone
 
 
 @flax.struct.dataclass
 class _Reach(Pytree):
     """Where residuals `u [C, K]` lie relative to their cones."""
 
-    away: jax.Array  # [C, K] from the nearest point of the cone to u
-    below: jax.Array  # [C] bool: the nearest point is the tip
-    beside: jax.Array  # [C] share of a residual on the cone's side, 1 / (1 + mu^2); 0 elsewhere
-    inward: jax.Array  # [C, K] normal of the side, first component 1
-    tangent: jax.Array  # [C, K] unit vector of sliding, first component 0
-    bend: jax.Array  # [C] curvature across it, not negative
+    away: Float[jax.Array, "*b C K"]  # from the nearest point of the cone to u
+    below: Bool[jax.Array, "*b C"]  # the nearest point is the tip
+    beside: Float[jax.Array, "*b C"]  # share of a residual on the cone's side, 1 / (1 + mu^2); 0 elsewhere
+    inward: Float[jax.Array, "*b C K"]  # normal of the side, first component 1
+    tangent: Float[jax.Array, "*b C K"]  # unit vector of sliding, first component 0
+    bend: Float[jax.Array, "*b C"]  # curvature across it, not negative
 
 
 def _reach(u: jax.Array, mu: jax.Array) -> _Reach:

@@ -58,7 +58,7 @@ def control(trajectories: Trajectory, time: Float[Array, ""] | float) -> Float[j
 
 
 def store(record: Record, state: State, now: Bool[Array, " S"]) -> Record:
-    """Store the present state as those samples that are taken `now [S]`."""
+    """Store the present state in the samples that are due; `now [S]` says which."""
     gripper, poses = state.qpos[:, :GRIPPER_DOF], state.qpos[:, GRIPPER_DOF:]
     gripper = jnp.concatenate([gripper[:, :4], gripper[:, 4:].sum(-1, keepdims=True)], -1)
     poses = poses.reshape(record.poses.shape[:1] + record.poses.shape[2:])

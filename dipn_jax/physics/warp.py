@@ -168,7 +168,7 @@ class Iterations(NamedTuple):
 
     @classmethod
     def of(cls, times: np.ndarray) -> Iterations:
-        """Return them from how often there were 0, 1, 2, ... iterations."""
+        """Return the statistics of a histogram: how often there were 0, 1, 2, ... iterations."""
         counts, total = np.arange(len(times)), max(int(times.sum()), 1)
         p95 = np.searchsorted(np.cumsum(times), 0.95 * total)
         return cls(float((counts * times).sum() / total), float(p95), int(counts[times > 0].max(initial=0)))

@@ -108,7 +108,7 @@ def kernels() -> types.SimpleNamespace:
         distance: wp.array[float],
         deepest: wp.array[float],
     ):
-        """Record each world's deepest contact, from when depth counts."""
+        """Record each world's deepest contact, once the grace time is over."""
         i = wp.tid()
         counts = wp.float64(tick[0]) * wp.float64(wp.static(period)) >= since[0]
         if i < contacts[0] and counts and distance[i] < 0.0:

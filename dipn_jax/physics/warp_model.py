@@ -66,7 +66,7 @@ def templates() -> Templates:
     axes = turns.reshape(-1, 3, 3)
 
     def rows(name: str, start: np.ndarray, count: np.ndarray, width: int) -> np.ndarray:
-        """Return a field a mesh `[K, width, ...]`; the first entry again where there are fewer."""
+        """Return a field of every mesh `[K, width, ...]`, padded with its first entry."""
         at = np.arange(width)
         values: np.ndarray = getattr(made, name)
         return values[start[:, None] + np.where(at < count[:, None], at, 0)]

@@ -165,7 +165,7 @@ def _drawn(motion: Float[Array, "*b 3"], rule: Rule) -> Float[jax.Array, "*b 3"]
 def _count_actions(
     decision: Decision, observation: Observation, missed: Int[jax.Array, "M 3"], estimate: Estimate, rule: Rule
 ) -> Decision:
-    """Return the decision between the same grasp and push by the actions that each costs.
+    """Return the decision made again, comparing the same grasp and push by how many actions each leads to.
 
     A push is one action, and has to save more than one grasp that misses. `value_now` and `value_push` become minus the
     expected numbers of actions besides one for each object; `values` of the candidates stay mean scores.

@@ -64,7 +64,7 @@ def dipn_motions(
 
 
 def dipn_predictor(model: dipn.DIPN, *, mirrors: bool = True) -> Predictor:
-    """Return DIPN as a predictor of each push's own distance; `mirrors` as of `dipn_motions`."""
+    """Return DIPN as a predictor; every push goes its own distance. `mirrors` as of `dipn_motions`."""
     graph, state = nnx.split(model)
 
     def predict(observation: Observation, pushes: Push) -> Float[jax.Array, "P N 3"]:

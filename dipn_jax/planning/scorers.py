@@ -1,4 +1,4 @@
-"""Scorers, functions that say what a network thinks of grasps, pushes and whole images."""
+"""Scorers: functions that return a network's scores of grasps or pushes, or summaries of whole images."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _scorer(model: nnx.Module, score: Callable[[Any, jax.Array], jax.Array]) -> 
 
 
 def aided_scorer(model: grasp.GraspNet, *, aids: Collection[Aid] = ALL_AIDS) -> Scorer:
-    """Return GN as a scorer to choose grasps by, with some of the aids of `names.Aid`."""
+    """Return the scorer that grasps are chosen by: GN with the given aids (`names.Aid`)."""
     return _scorer(model, functools.partial(grasp.aided_scores, aids=tuple(aids)))
 
 

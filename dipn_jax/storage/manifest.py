@@ -54,7 +54,7 @@ def update_manifest(folder: pathlib.Path, *, made: Mapping[str, Any] | None = No
       folder: the data set.
       made: entries by name, as `shards.write_shard` returns them: of shards that need not be read for it.
     """
-    with _turn(folder) as alone:
+    with _file_lock(folder) as alone:
         manifest = _rebuild(folder, made or {})
         while not alone and set(manifest["shards"]) != {path.name for path in shards.shard_files(folder)}:
             manifest = _rebuild(folder, made or {})  # somebody whom no lock kept waiting has added a shard
@@ -69,7 +69,7 @@ def update_whole(folder: pathlib.Path, *, made: Mapping[str, Any], sizes: Mappin
       made: entries by name, as for `update_manifest`.
       sizes: episodes of every shard that was asked for, by name: one that is to be made longer is still missing.
     """
-    with _turn(folder):
+    with _file_lock(folder):
         entries = _entries(folder, made)
         return write(folder, entries) if holds(entries, sizes) else None
 
@@ -83,14 +83,14 @@ def forget(folder: pathlib.Path, names: Collection[str]) -> None:
     """Take shards out of the manifest that are about to be made anew; it is left alone if it lists none of them."""
     if not (folder / MANIFEST).exists():
         return
-    with _turn(folder):
+    with _file_lock(folder):
         known = _read(folder)["shards"]
         if not known.keys().isdisjoint(names):
             write(folder, {name: entry for name, entry in known.items() if name not in names})
 
 
 @contextlib.contextmanager
-def _turn(folder: pathlib.Path) -> Iterator[bool]:
+def _file_lock(folder: pathlib.Path) -> Iterator[bool]:
     """Wait until no other worker writes the manifest; yield whether that is certain, as files can be locked."""
     with (folder / ".lock").open("wb") as lock:
         try:

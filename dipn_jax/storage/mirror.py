@@ -71,7 +71,7 @@ def _copied(url: str) -> pathlib.Path:
     bucket, folder = Bucket(url), folder_of(url)
     folder.mkdir(parents=True, exist_ok=True)
     addresses.show_instead(folder, url)
-    with _turn(folder):
+    with _file_lock(folder):
         described = {name: found for name, found in bucket.list().items() if not _is_shard(name)}
         _fetch(bucket, folder, described)
         # listed afterwards: each shard that the manifest names is there
@@ -125,7 +125,7 @@ def _known(folder: pathlib.Path) -> dict[str, Found]:
 
 
 @contextlib.contextmanager
-def _turn(folder: pathlib.Path) -> Iterator[None]:
+def _file_lock(folder: pathlib.Path) -> Iterator[None]:
     """Wait until no other process updates the copy, if files can be locked."""
     with (folder / ".lock").open("wb") as lock:
         with contextlib.suppress(OSError):

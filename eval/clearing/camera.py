@@ -22,7 +22,7 @@ BOUNDS = {"height_noise": 0.02, "holes": 0.5, "image_noise": 0.5}
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """What is seen of a table."""
+    """What the camera gives the policy: which masks, and how much noise."""
 
     masks: Literal["found", "true"] = "found"
     """found: cut out of the image by colour and height, as from a camera; true: the simulator's."""

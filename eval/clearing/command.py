@@ -65,8 +65,8 @@ def clear(
       camera: what the method sees; physics+gn takes --masks true only.
       candidates: pushes considered at a time.
       distances: metres of a push; of several, the candidates have one each, in turn, and the best is chosen.
-      gamma: discount of a push's value.
-      threshold: grasp at once above this score.
+      gamma: factor of a push's value, 0 to 1.
+      threshold: score, 0 to 1, above which the best grasp is made at once.
       released: add the clauses of DIPN's released code: a lone object is grasped; a push must raise the best score,
         too; gamma applies only to pushes after which that is over 0.5; and no object may leave the workspace if it
         moves twice as far as predicted.

@@ -9,7 +9,7 @@ import zlib
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int, Num
 
 from dipn_jax.errors import UserError
 from dipn_jax.sight import imagine, masks, render
@@ -26,18 +26,22 @@ class Film:
     """The states and decisions of T actions on one table of N objects."""
 
     what: np.ndarray  # [T] str: push, grasp held, grasp missed
-    shape: np.ndarray  # [T + 1, N] int32: which objects there are, before each action and at the end
-    poses: np.ndarray  # [T + 1, N, 7] metres, wxyz
-    push: np.ndarray  # [T, 4] x, y (metres), angle (radians), distance (metres) of the best push
-    grasp: np.ndarray  # [T, 3] rotation, row, column of the best grasp
-    values: np.ndarray  # [T, 3] its score; mean score now; gamma times the mean after the push, -inf if none
-    motion: np.ndarray  # [T, N, 3] dx, dy (metres), dtheta (radians) predicted for the push, of each mask
-    label: np.ndarray  # [T, H, W] int8: masks that the policy decided on
-    missed: np.ndarray  # [T, M, 3] grasps that it knew to have missed
-    size: np.ndarray  # [N, 3] metres
-    color: np.ndarray  # [N, 3]
-    mass: np.ndarray  # [N] kg
-    friction: np.ndarray  # [N]
+    shape: Int[np.ndarray, "states N"]  # which objects there are, before each action and at the end
+    poses: Float[np.ndarray, "states N 7"]  # metres, wxyz
+    push: Float[np.ndarray, "actions 4"]  # x, y (metres), angle (radians), distance (metres) of the best push
+    grasp: Num[np.ndarray, "actions 3"]  # rotation, row, column of the best grasp
+    values: Float[
+        np.ndarray, "actions 3"
+    ]  # its score; mean score now; gamma times the mean after the push, -inf if none
+    motion: Float[
+        np.ndarray, "actions masks 3"
+    ]  # dx, dy (metres), dtheta (radians) predicted for the push, of each mask
+    label: Int[np.ndarray, "actions H W"]  # masks that the policy decided on
+    missed: Num[np.ndarray, "actions M 3"]  # grasps that it knew to have missed
+    size: Float[np.ndarray, "N 3"]  # metres
+    color: Float[np.ndarray, "N 3"]
+    mass: Float[np.ndarray, " N"]  # kg
+    friction: Float[np.ndarray, " N"]
 
     def before(self, step: int) -> np.ndarray:
         """Return the colours `[224, 224, 3]` before an action."""

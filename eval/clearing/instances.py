@@ -7,6 +7,7 @@ import pathlib
 import zlib
 
 import numpy as np
+from jaxtyping import Float
 
 from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
@@ -32,7 +33,7 @@ class Instance:
 
     name: str
     scene: Scene  # numpy, [N]
-    poses: np.ndarray  # [N, 7]
+    poses: Float[np.ndarray, "N 7"]
     objects: int  # on the table at the beginning
     number: int = 0  # of its random keys; it does not depend on the other tables
     grasps: int = 0  # made so far, held or missed

@@ -66,8 +66,8 @@ def sweep(
       camera: what the policy sees.
       candidates: pushes considered at a time; the choosing policy gives each of them one of the distances.
       pushes: scenes of 1 to 7 objects, a push in each, for the prediction error; 0: do not measure it.
-      gamma: discount of a push's value.
-      threshold: grasp at once above this score.
+      gamma: factor of a push's value, 0 to 1.
+      threshold: score, 0 to 1, above which the best grasp is made at once.
       aids: small rules of ours that are in no paper, as of dipn-eval clear.
       seed: random seed of scenes, perturbations and candidates.
       engine: physics engine.

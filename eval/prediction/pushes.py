@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from dipn_jax import batching, structs
 from dipn_jax.engine import Engine
@@ -29,8 +30,8 @@ class Executed:
 
     items: SettledScene  # [B] before the pushes
     pushes: Push  # [B]
-    truth: np.ndarray  # [B, 1 + K, N, 7] poses before, and after each of DISTANCES
-    rolled: np.ndarray | None  # [B, K, N, 7] poses after the same pushes with nominal masses and frictions
+    truth: Float[np.ndarray, "B _ N 7"]  # poses before, and after each of DISTANCES
+    rolled: Float[np.ndarray, "B K N 7"] | None  # poses after the same pushes with nominal masses and frictions
 
     def __len__(self) -> int:
         return len(self.pushes.angle)

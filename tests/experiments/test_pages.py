@@ -166,7 +166,7 @@ def test_the_page_of_clearing_is_what_is_kept(docs: pathlib.Path, monkeypatch: p
     monkeypatch.chdir(docs.parent)
     root = pathlib.Path("results")
     values, sweep = files.read_json(DOCS / "clearing.json"), files.read_json(DOCS / "sweep.json")
-    for name in ("clearing-tables.json", "sweep.json"):
+    for name in ("clearing-tables.json", "sweep.json", "push-or-grasp.json"):
         shutil.copy(DOCS / name, docs)
     clearing.write_page(root, docs=docs)
     written = files.read_json(docs / "clearing.json")

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jaxtyping import Float
 
 from dipn_jax import structs
 from dipn_jax.engine import Engine
@@ -53,11 +54,11 @@ UNCOVERED_REWARD = 0.8
 class Look(Pytree):
     """A table as a learner sees it, and the actions that it may choose."""
 
-    height: Array  # [H, W] metres
+    height: Float[Array, "*b H W"]  # metres
     push: Push  # the best one
-    push_value: Array  # [] -inf if no push can be begun
+    push_value: Float[Array, "*b"]  # -inf if no push can be begun
     grasp: Grasp  # the best one
-    grasp_value: Array  # []
+    grasp_value: Float[Array, "*b"]
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("scorer", "distance"))
@@ -72,7 +73,7 @@ def look(
     scorer: Scorer | None,
     distance: float,
 ) -> Look:
-    """Look at the tables `[T]` that are `wanted [T]`, and find the best actions; zeros for the others."""
+    """Return images and best actions of the tables `[T]` that are `wanted [T]`; zeros for the other tables."""
     network: VPG = nnx.merge(graph, params, rest)
     network.eval()
     pushes, grasps = scorers.value_scorers(network)

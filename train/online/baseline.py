@@ -187,7 +187,7 @@ def _identity(
 
 
 def _act(state: State, look: Callable[..., Look], engine: Engine, scenes: SceneConfig, config: BaselineConfig) -> None:
-    """Act once on every table; keep what happened and what it teaches."""
+    """Act once on every table, and store the outcomes and their learning targets."""
     count, before = config.tables, state.tables
     anew = np.ones(count, bool) if state.then is None else state.anew
     now: Look = jax.device_get(look(before.scene, before.poses, anew))

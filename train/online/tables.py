@@ -7,6 +7,7 @@ import functools
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from dipn_jax import seeds, structs
 from dipn_jax.engine import Engine
@@ -27,7 +28,7 @@ class Tables:
     """T tables, with everything about them that an interrupted run has to keep."""
 
     scene: Scene  # [T, N], numpy
-    poses: np.ndarray  # [T, N, 7]
+    poses: Float[np.ndarray, "T N 7"]
     spare: SettledScene  # tables that replace others later
     seed: int
     purpose: int  # a `seeds.Purpose`

@@ -103,7 +103,7 @@ def test_masks_found_in_the_image_are_measured_by_themselves(
         lost.append(bool((true == 0).any()))
         return np.where(true == 0, ABSENT, true), np.ones(slots, bool)
 
-    monkeypatch.setattr(segment, "find", find)
+    monkeypatch.setattr(segment, "segment_as", find)
     still = Slides(np.zeros(2, np.float32))
     rows, _ = push_errors.measured(
         {}, still, CONFIG, Partial(tmp_path, {}), scenes=4, seed=0, physics=True, segmented=True
