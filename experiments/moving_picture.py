@@ -30,6 +30,7 @@ from dipn_jax import structs
 from dipn_jax.errors import UserError
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import candidates
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.sight import render
 from dipn_jax.structs import Push, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER, WORKSPACE
@@ -45,7 +46,7 @@ FRAME_SECONDS = 0.12
 """Seconds for which a frame is shown."""
 HOLD_FRAMES = 8
 """Frames for which a decision is shown before it is executed, and the result after a push."""
-THRESHOLD = 0.7
+THRESHOLD = PolicyConfig().grasp_above
 """Score above which `dipn-eval clear` grasps at once by default."""
 BACKGROUND = "#1b1b1b"
 """Colour of the background."""

@@ -26,7 +26,11 @@ TESTS: dict[str, tuple[str, ...]] = {
     "eval/metrics.py": ("tests/eval/test_metrics.py", "tests/eval/test_known_numbers.py"),
     "eval/clearing/lockstep.py": ("tests/eval/clearing/test_end_rules.py", "tests/eval/clearing/test_counts.py"),
     "dipn_jax/networks/losses.py": ("tests/dipn_jax/networks/test_losses.py",),
-    "train/split.py": ("tests/train/test_split.py", "tests/train/test_example_order.py", "tests/train/test_joined.py"),
+    "train/split.py": (
+        "tests/train/test_split.py",
+        "tests/train/test_example_order.py",
+        "tests/train/test_several_data_sets.py",
+    ),
     "dipn_jax/sight/masks.py": ("tests/dipn_jax/sight/test_masks.py",),
     "dipn_jax/sight/imagine.py": ("tests/dipn_jax/sight/test_imagine.py",),
     "dipn_jax/planning/planner.py": ("tests/dipn_jax/planning/test_planner.py",),

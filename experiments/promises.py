@@ -127,7 +127,7 @@ PROMISES = (
         (
             f"{_STORAGE}/test_owner.py::test_the_second_is_told_who_has_it_and_a_dead_owner_does_not_block",
             "tests/train/test_loop.py::test_a_run_that_is_going_on_is_not_started_again",
-            "tests/eval/test_owned.py::test_a_second_evaluation_into_a_folder_is_told_who_has_it",
+            "tests/eval/test_one_owner.py::test_a_second_evaluation_into_a_folder_is_told_who_has_it",
         ),
     ),
     Promise(

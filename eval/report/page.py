@@ -21,8 +21,6 @@ from .. import drawing, metrics
 from ..clearing import sweeping
 from . import comparison, networks
 
-FILM_ROWS = 4
-"""Number of pushes in the figure of predictions."""
 _FILMS = {
     "before": arrays.Form("fu", ("pushes", "H", "W", 3)),
     "predicted": arrays.Form("fu", ("pushes", "H", "W", 3)),
@@ -145,7 +143,7 @@ def _load(path: pathlib.Path) -> Any:
 
 
 def _prediction_film(films: Any) -> Any:
-    count = min(FILM_ROWS, len(films["before"]))
+    count = min(comparison.FILM_ROWS, len(films["before"]))
     figure, axes = plt.subplots(count, 3, figsize=(7.5, 2.5 * count), squeeze=False)
     for row in range(count):
         drawing.show(axes[row, 0], films["before"][row], "before, push" if row == 0 else "")
