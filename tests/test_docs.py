@@ -35,7 +35,7 @@ OPTION = re.compile(r"`(--[a-z][a-z0-9_-]*)[^`]*`")
 """An option that stands in a sentence without its command."""
 FOREIGN = {"--cpus-per-task", "--dependency", "--gpus-per-task", "--requeue", "--xla_gpu_enable_command_buffer"}
 """Options of other programs, of which pages speak."""
-OURS = {"--dry-run", "--list", "--only", "--page", "--scale", "--toy", "--out", "--seed"}
+OURS = {"--dry-run", "--minutes", "--list", "--only", "--page", "--scale", "--toy", "--out", "--seed"}
 """Options of experiments and benchmarks."""
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 

@@ -58,7 +58,7 @@ def test_an_interrupted_run_ends_as_an_uninterrupted_one(
             os.kill(os.getpid(), signal.SIGTERM)  # the current step is finished first
         return examples
 
-    monkeypatch.setattr(devices.OneDevice, "share", interrupt)
+    monkeypatch.setattr(devices.OneDevice, "shard_batch", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fit(task, BRIEF, tmp_path / "cut")
     assert checkpoint.newest(tmp_path / "cut")[1]["step"] == 4  # type: ignore[index]
@@ -125,7 +125,7 @@ def test_an_interrupted_run_says_that_its_last_step_cannot_be_saved(
     def full(*_: Any) -> None:
         raise UserError("step 1 cannot be saved")
 
-    monkeypatch.setattr(devices.OneDevice, "share", interrupt)
+    monkeypatch.setattr(devices.OneDevice, "shard_batch", interrupt)
     monkeypatch.setattr(checkpoint, "_write", full)
     with pytest.raises(UserError, match="step 1 cannot be saved"):
         fit(task, BRIEF, tmp_path)
