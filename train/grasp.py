@@ -60,7 +60,7 @@ class PretrainTask:
     network = "grasp"
 
     def __init__(self, data: Folders, config: grasp.GraspConfig, *, space: Space | None = None) -> None:
-        """Load data sets.
+        """Check data sets; an episode is read when it is first fetched, with the others of its shard.
 
         Args:
           data: folders of images; the last tenth of each is held out.
@@ -201,7 +201,7 @@ class GraspTask:
     def __init__(
         self, data: Folders, config: grasp.GraspConfig, *, limit: int | None = None, space: Space | None = None
     ) -> None:
-        """Load data sets.
+        """Check data sets; an episode is read when it is first fetched, with the others of its shard.
 
         Args:
           data: folders of grasp episodes; the last tenth of each is held out.

@@ -52,7 +52,7 @@ class PushTask:
         found: bool = False,
         space: Space | None = None,
     ) -> None:
-        """Load data sets.
+        """Check data sets; an episode is read when it is first fetched, with the others of its shard.
 
         Args:
           data: folders of push episodes; the last tenth of each is held out.
