@@ -100,7 +100,7 @@ def writing_rate(objects: int, episodes: int, *, shards: int, few: int, seed: in
 
 
 def reading_rate(objects: int, episodes: int, *, shards: int, few: int, seed: int) -> float:
-    """Measure how many push episodes a second a training reads, checks and decodes from files just written."""
+    """Measure how many push episodes a second `read_episodes` checks and decodes from files that were just written."""
     made = synthetic(real(objects, few, seed), episodes, seed)
     task = job(objects, episodes, shards=shards, seed=seed)
     with tempfile.TemporaryDirectory() as name, quiet(), mock.patch.object(generate, "shard", lambda *_: (made, {})):

@@ -20,7 +20,6 @@ from flax import nnx
 from benchmarks import push_worker
 from benchmarks.harness import Setting, Skipped, alternate, quiet
 from benchmarks.worker import versus
-from dipn_jax import structs
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.physics import make_engine
 from dipn_jax.planning import candidates, predictors
@@ -61,7 +60,7 @@ def training_examples(preset: str, batch: int, seed: int, *, episodes: int = 72)
     """Return the inputs `[B, ...]` and the target `[B, N, 10, 3]` of a training step, by their names."""
     with tempfile.TemporaryDirectory() as name:
         task = small_task(name, preset, seed, episodes=episodes)
-        examples = task.prepare(structs.take(task.train_set, np.arange(batch)))
+        examples = task.prepare(task.train_set.take(np.arange(batch)))
     arrays = {field: np.asarray(getattr(examples.inputs, field)) for field in push_worker.FIELDS}
     return {"target": np.asarray(examples.target), **arrays}
 
@@ -88,11 +87,11 @@ def input_share(setting: Setting) -> Iterator[tuple[str, float]]:
     batch = BATCHES["compact"]
     with tempfile.TemporaryDirectory() as name:
         task = small_task(name, "compact", setting.seed)
-    rows = np.arange(batch)
-    episodes = structs.take(task.train_set, rows)
+        rows = np.arange(batch)
+        episodes = task.train_set.take(rows)
+        with quiet():
+            kept = task.fetch(rows)
     model = checkpoint.build("dipn", task.network_config)
-    with quiet():
-        kept = task.fetch(rows)
     graph, *state = nnx.split(model, nnx.Param, ...)
     optimizer = make_optimizer(TrainConfig())
     state.append(optimizer.init(state[0]))

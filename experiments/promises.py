@@ -97,10 +97,13 @@ PROMISES = (
         ),
     ),
     Promise(
-        "A damaged shard is named, set aside by `dipn-datagen repair` and made again with the same bytes.",
+        "A damaged shard is named, set aside by `dipn-datagen repair` and made again with the same bytes. One that a "
+        "training finds when it first uses it ends the training with one line; the last checkpoint is whole.",
         (
             f"{_STORAGE}/test_records.py::test_a_damaged_shard_is_named_and_repaired",
             "tests/test_commands.py::test_a_truncated_shard",
+            "tests/train/test_damaged.py::"
+            "test_a_damaged_shard_ends_the_training_that_uses_it_and_what_was_saved_is_whole",
         ),
     ),
     Promise(

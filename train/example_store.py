@@ -49,7 +49,8 @@ class ExampleStore:
         """
         index = np.asarray(index)
         if self._made is None:
-            self._open(self._make(_filled(index[:1])))
+            shown = np.resize(index[:1], len(_filled(np.unique(index)[: batching.BATCH])))  # a shape that is compiled
+            self._open(self._make(shown))
         assert self._made is not None
         missing = np.unique(index[~self._made[index]])
         for begin in range(0, len(missing), batching.BATCH):

@@ -12,17 +12,18 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float, Int
 
-from dipn_jax import batching, geometry, structs
+from dipn_jax import batching, geometry
 from dipn_jax.networks import grasp, losses
 from dipn_jax.sight import fingers, render
 from dipn_jax.storage import serialization
+from dipn_jax.storage.on_demand import Episodes
 from dipn_jax.storage.space import Space
 from dipn_jax.structs import Array, GraspEpisode, Observation, Pytree, Scene, SettledScene
 from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
 from .example_store import ExampleStore
-from .split import Folders, first, load_sides, within
+from .split import Folders, load_sides
 
 PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
@@ -60,7 +61,7 @@ class PretrainTask:
     network = "grasp"
 
     def __init__(self, data: Folders, config: grasp.GraspConfig, *, space: Space | None = None) -> None:
-        """Load data sets.
+        """Check data sets; an episode is read when it is first fetched, with the others of its shard.
 
         Args:
           data: folders of images; the last tenth of each is held out.
@@ -69,13 +70,14 @@ class PretrainTask:
         """
         sides = load_sides(data, kind="images", space=space)
         self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
-        self.size, self.parts = len(self.train_set.fault), sides.parts
-        self.examples = self.size + len(self.test_set.fault)
+        self.size, self.parts = len(self.train_set), sides.parts
+        self.examples = self.size + len(self.test_set)
         self.network_config = config
 
     def fetch(self, index: np.ndarray) -> SettledScene:
         """See `loop.Task`."""
-        return structs.take(self.train_set, index)
+        taken: SettledScene = self.train_set.take(index)
+        return taken
 
     def views(self, settled: SettledScene, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return images `[B, V, V, 4]`, labels `[B, V, V]` and weights `[B, V, V]` of random views."""
@@ -100,8 +102,8 @@ class PretrainTask:
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss on views of held-out scenes."""
         graph, state = nnx.split(model)
-        index = np.arange(min(16, len(self.test_set.fault)))
-        loss = self._measure(graph, state, structs.take(self.test_set, index))
+        index = np.arange(min(16, len(self.test_set)))
+        loss = self._measure(graph, state, self.test_set.take(index))
         return {"held_out_loss": float(loss)}
 
     @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -200,7 +202,7 @@ class GraspTask:
     def __init__(
         self, data: Folders, config: grasp.GraspConfig, *, limit: int | None = None, space: Space | None = None
     ) -> None:
-        """Load data sets.
+        """Check data sets; an episode is read when it is first fetched, with the others of its shard.
 
         Args:
           data: folders of grasp episodes; the last tenth of each is held out.
@@ -212,21 +214,20 @@ class GraspTask:
           UserError: no folder; one is damaged, or holds something else; or they have fewer episodes.
         """
         space = space or Space()
-        sides = load_sides(data, kind="grasp", space=space)
-        self.train_set, self.test_set = first(sides.learnt, limit, what="grasps"), sides.held_out
+        sides = load_sides(data, kind="grasp", what="grasps", limit=limit, space=space)
+        self.train_set, self.test_set, self.parts = sides.learnt, sides.held_out, sides.parts
         self.fingerprint = sides.fingerprint if limit is None else f"{sides.fingerprint}:{limit}"
-        self.size = self.examples = len(self.train_set.fault)
-        self.parts = within(sides.parts, self.size)
+        self.size = self.examples = len(self.train_set)
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS
         self._kept = self._keeper(self.train_set, space)
         self._held_out = self._keeper(self.test_set, Space())
 
-    def _keeper(self, episodes: GraspEpisode, space: Space) -> ExampleStore:
+    def _keeper(self, episodes: Episodes, space: Space) -> ExampleStore:
         def make(index: np.ndarray) -> Window:
-            return self.prepare(structs.take(episodes, index))
+            return self.prepare(episodes.take(index))
 
-        return ExampleStore(make, len(episodes.fault), space=space, about=self.fingerprint)
+        return ExampleStore(make, len(episodes), space=space, about=self.fingerprint)
 
     def prepare(self, episodes: GraspEpisode) -> Window:
         """Return windows `[B]` of episodes `[B]` as NumPy arrays."""
@@ -240,9 +241,9 @@ class GraspTask:
         """Let another process take up the windows that are kept in files."""
         self._kept.close()
 
-    def _take(self, kept: ExampleStore, episodes: GraspEpisode, index: np.ndarray) -> Window:
+    def _take(self, kept: ExampleStore, episodes: Episodes, index: np.ndarray) -> Window:
         if self.network_config.preset == "paper":
-            return self.prepare(structs.take(episodes, index))
+            return self.prepare(episodes.take(index))
         taken: Window = kept.take(index)
         return taken
 
@@ -253,7 +254,7 @@ class GraspTask:
     def evaluate(self, model: nnx.Module) -> dict[str, float]:
         """See `loop.Task`: loss and accuracy on held-out grasps."""
         graph, state = nnx.split(model)
-        size, rows, count = batching.BATCH, [], len(self.test_set.fault)
+        size, rows, count = batching.BATCH, [], len(self.test_set)
         for begin in range(0, count, size):
             index = np.arange(begin, begin + size)
             weight = (index < count).astype(np.float32)

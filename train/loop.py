@@ -50,7 +50,11 @@ class Task(LossTask, Protocol):
     fingerprint: str  # of the data
 
     def fetch(self, index: np.ndarray) -> Any:
-        """Return the examples `index [B]`."""
+        """Return the examples `index [B]`.
+
+        Raises:
+          UserError: a shard that holds some of them cannot be read.
+        """
         ...
 
     def evaluate(self, model: nnx.Module) -> dict[str, float]:

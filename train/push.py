@@ -13,18 +13,19 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Bool, Float
 
-from dipn_jax import geometry, structs
+from dipn_jax import geometry
 from dipn_jax.errors import UserError
 from dipn_jax.networks import dipn, losses, push_frame
 from dipn_jax.networks.push_frame import PushInput, View
 from dipn_jax.sight import render, segment
+from dipn_jax.storage.on_demand import DataSet, Episodes
 from dipn_jax.storage.space import Space
 from dipn_jax.structs import Array, PushEpisode, Pytree
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
 from .example_store import ExampleStore
-from .split import Folders, first, load_sides, within
+from .split import Folders, load_sides
 
 
 @flax.struct.dataclass
@@ -52,7 +53,7 @@ class PushTask:
         found: bool = False,
         space: Space | None = None,
     ) -> None:
-        """Load data sets.
+        """Check data sets; an episode is read when it is first fetched, with the others of its shard.
 
         Args:
           data: folders of push episodes; the last tenth of each is held out.
@@ -68,29 +69,28 @@ class PushTask:
                 f"--centimetres {' '.join(map(str, centimetres))}: want whole numbers from 1 to {PUSH_STEPS}"
             )
 
-        def choose(episodes: PushEpisode, folder: pathlib.Path) -> np.ndarray | None:
-            return _chosen(episodes, folder, centimetres, without)
+        def choose(of: DataSet, folder: pathlib.Path) -> np.ndarray | None:
+            return _chosen(of, folder, centimetres, without)
 
         space = space or Space()
-        sides = load_sides(data, kind="push", choose=choose, space=space)
-        self.train_set, self.test_set = first(sides.learnt, limit, what="pushes"), sides.held_out
-        count = len(self.train_set.fault)
+        sides = load_sides(data, kind="push", what="pushes", choose=choose, limit=limit, space=space)
+        self.train_set, self.test_set, self.parts = sides.learnt, sides.held_out, sides.parts
+        count = len(self.train_set)
         self.network_config = config
         self.size = self.examples = count
-        self.parts = within(sides.parts, count)
         masks = ("found",) if found else ()
         self.fingerprint = ":".join(map(str, (sides.fingerprint, count, centimetres, *without, *masks)))
         self.centimetres = np.array(centimetres, np.int32)
         self.found = found
-        self.slots = sides.slots
+        self.slots = self.train_set.slots
         self._kept = self._keeper(self.train_set, space)
         self._held_out = self._keeper(self.test_set, Space())
 
-    def _keeper(self, episodes: PushEpisode, space: Space) -> ExampleStore:
+    def _keeper(self, episodes: Episodes, space: Space) -> ExampleStore:
         def make(index: np.ndarray) -> Example:
-            return _halved(self.prepare(structs.take(episodes, index)))
+            return _halved(self.prepare(episodes.take(index)))
 
-        return ExampleStore(make, len(episodes.fault), space=space, about=self.fingerprint)
+        return ExampleStore(make, len(episodes), space=space, about=self.fingerprint)
 
     def fetch(self, index: np.ndarray) -> Example:
         """See `loop.Task`. A `compact` network's examples are small (20 KB), and kept once they have been rendered."""
@@ -100,9 +100,9 @@ class PushTask:
         """Let another process take up the examples that are kept in files."""
         self._kept.close()
 
-    def _take(self, kept: ExampleStore, episodes: PushEpisode, index: np.ndarray) -> Example:
+    def _take(self, kept: ExampleStore, episodes: Episodes, index: np.ndarray) -> Example:
         if self.network_config.preset == "paper":
-            return self.prepare(structs.take(episodes, index))
+            return self.prepare(episodes.take(index))
         taken: Example = kept.take(index)
         return taken
 
@@ -147,7 +147,7 @@ class PushTask:
         """See `loop.Task`: loss, and position error of moved objects (mm), at the largest distance."""
         total: dict[str, list[Any]] = {"held_out_loss": [], "moved_error_mm": []}
         graph, state = nnx.split(model)
-        size, count = 32, len(self.test_set.fault)
+        size, count = 32, len(self.test_set)
         for begin in range(0, count, size):
             index = np.arange(begin, begin + size) % count
             weight = np.arange(begin, begin + size) < count
@@ -159,17 +159,17 @@ class PushTask:
 
 
 def _chosen(
-    episodes: PushEpisode, folder: pathlib.Path, centimetres: tuple[int, ...], without: tuple[str, ...]
+    of: DataSet, folder: pathlib.Path, centimetres: tuple[int, ...], without: tuple[str, ...]
 ) -> np.ndarray | None:
-    """Return the numbers of those episodes that have no object of some classes; None for all.
+    """Return the numbers of those episodes of a data set that have no object of some classes; None for all.
 
     Raises:
       UserError: none is left, or pushes are shorter than the distances that are to be learnt.
     """
-    kept, distances = None, episodes.push.distance
+    kept, distances = None, of.column("push.distance")
     if without:
         classes = [shapes.CLASSES.index(name) for name in without]
-        kept = np.flatnonzero(~np.isin(episodes.scene.shape, classes).any(1))
+        kept = np.flatnonzero(~np.isin(of.column("scene.shape"), classes).any(1))
         if not len(kept):
             raise UserError(f"--without {' '.join(without)}: leaves none of the pushes of {folder}; name fewer classes")
         distances = distances[kept]

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from dipn_jax import structs
-from dipn_jax.errors import UserError
 from dipn_jax.storage import held_out, records, shards
-from dipn_jax.system import typed
+from dipn_jax.storage.on_demand import DataSet
 
 SPLITS = ("train", "test")
 """Names of what is learnt from and what is held out."""
@@ -100,32 +99,22 @@ def open_source(folder: pathlib.Path) -> Source:
       UserError: there is none, it is damaged, or it cannot be split.
     """
     kind = str(records.summary(folder)["kind"])
-    entries = records.checked(folder, kind=kind)
-    found = _surveyed(folder, entries)
-    widths = {_slots(shard.path) for shard in found}
-    if len(widths) > 1:
-        said = " and ".join(map(str, sorted(widths)))
-        raise UserError(f"data set {folder}: shards with {said} object slots; want one number in a folder")
-    count = sum(shard.count for shard in found)
-    cut = held_out.cut((shards.read_sizes(shard.path) for shard in found), count, folder)
-    return Source(folder, kind, widths.pop(), found, cut, records.fingerprint(entries))
+    opened = records.opened(folder, kind=kind)
+    found = _surveyed(opened)
+    cut = held_out.cut(lambda rows: opened.column("scene.size", range(rows.start, rows.stop)), len(opened), folder)
+    return Source(folder, kind, opened.slots, found, cut, opened.fingerprint)
 
 
-def _slots(path: pathlib.Path) -> int:
-    return int(shards.read_meta(path)["columns"]["scene.shape"]["shape"][0])
-
-
-def _surveyed(folder: pathlib.Path, names: Iterable[str]) -> tuple[Shard, ...]:
+def _surveyed(opened: DataSet) -> tuple[Shard, ...]:
     """Return the shards of a data set in order, with their first episodes and scenes."""
     found: list[Shard] = []
     first = begun = 0
     before: np.ndarray | None = None
-    for name in names:
-        size = shards.read_sizes(typed.inside(folder, name))
-        same = before is not None and before.shape == size[0].shape
-        rows = held_out.begins(size, before=before if same else None)
+    for shard in opened.shards:
+        size = shards.read_column(shard.path, "scene.size")
+        rows = held_out.begins(size, before=before)
         goes_on = len(rows) == 0 or rows[0] != 0
-        found.append(Shard(folder / name, len(size), first, begun - 1 if goes_on else begun))
+        found.append(Shard(shard.path, len(size), first, begun - 1 if goes_on else begun))
         first, begun, before = first + len(size), begun + len(rows), size[-1]
     return tuple(found)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,6 +12,8 @@ from dipn_jax.errors import UserError
 
 MOST_HELD_OUT = 1000
 """Number of episodes that are held out at most."""
+REACH = 100
+"""Episodes before and after the wanted place among which the beginning of a scene is looked for first."""
 
 
 def begins(
@@ -27,28 +29,29 @@ def begins(
     return np.flatnonzero(np.concatenate([[first], (size[1:] != size[:-1]).any((1, 2))]))
 
 
-def cut(sizes: Iterable[Float[np.ndarray, "_ _ 3"]], count: int, data: pathlib.Path) -> int:
+def cut(
+    read: Callable[[slice], Float[np.ndarray, "_ _ 3"]], count: int, data: pathlib.Path, *, reach: int = REACH
+) -> int:
     """Return the number of the first episode that is held out: about the last tenth is, 1,000 at most.
 
-    It begins a scene, so that no scene is on both sides.
+    It begins a scene, so that no scene is on both sides: of those that begin nearest to where a tenth would, the first.
 
     Args:
-      sizes: sizes of the objects (metres) of all episodes in order, in any number of parts.
+      read: function of a slice of episodes that returns the sizes of their objects (metres); it is asked for those
+        near the cut alone.
       count: number of episodes.
       data: folder that they are from, for the error message.
+      reach: episodes before and after the wanted place among which a scene is looked for first.
 
     Raises:
       UserError: there are fewer than two scenes.
     """
     wanted = count - min(MOST_HELD_OUT, max(1, count // 10))
-    best, first, last = 0, 0, None
-    for size in sizes:
-        found = first + begins(size, before=last)
-        found = found[found > 0]
+    while True:
+        first, end = max(wanted - reach - 1, 0), min(wanted + reach + 1, count)
+        found = begins(read(slice(first, end)))[1:] + first  # what the first row begins is not known
         if len(found):
-            near = int(found[np.argmin(np.abs(found - wanted))])
-            best = near if not best or abs(near - wanted) < abs(best - wanted) else best
-        first, last = first + len(size), size[-1]
-    if not best:
-        raise UserError(f"data set {data}: {count} examples of one scene; want at least two scenes")
-    return best
+            return int(found[np.argmin(np.abs(found - wanted))])
+        if (first, end) == (0, count):
+            raise UserError(f"data set {data}: {count} examples of one scene; want at least two scenes")
+        reach *= 4

@@ -8,23 +8,21 @@ import json
 import pathlib
 from typing import Any
 
-import numpy as np
-
-from dipn_jax import structs
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
 from dipn_jax.storage import accounting, manifest, mirror, shards
 from dipn_jax.storage.manifest import MANIFEST
+from dipn_jax.storage.on_demand import DataSet, Episodes, Shard
 from dipn_jax.storage.space import Space
 from dipn_jax.structs import GraspEpisode, PushEpisode, SettledScene
 from dipn_jax.system import files, machine
 
-PROGRESS_SHARDS = 100
-"""Number of shards from which on progress is shown while they are read."""
 Problems = list[tuple[pathlib.Path, str]]
 """Shards, each with what is wrong with it."""
 Look = tuple[str, dict[str, Any] | None]
 """What is wrong with a shard, an empty text if nothing is; and then its metadata."""
+Metas = dict[pathlib.Path, dict[str, Any]]
+"""The metadata of shards."""
 
 
 def _look(path: pathlib.Path, entry: dict[str, Any]) -> Look:
@@ -66,12 +64,21 @@ def verify(folder: pathlib.Path) -> Problems:
 
 def examined(folder: pathlib.Path) -> tuple[Problems, str | None]:
     """Return what `verify` does, and in one line what differs between those who made the shards that are whole."""
+    return _said(folder, _looks(folder))
+
+
+def _looks(folder: pathlib.Path) -> list[tuple[pathlib.Path, Look]]:
+    """Look at every shard of a data set."""
     listed = manifest.listed(folder)
     paths = [folder / name for name in listed]
     with concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool:
         looks = list(zip(paths, pool.map(_look, paths, listed.values()), strict=True))
     looks += [(path, _look_through(path)) for path in manifest.unlisted(folder, listed)]
-    looks = _of_one_kind(looks)
+    return _of_one_kind(looks)
+
+
+def _said(folder: pathlib.Path, looks: list[tuple[pathlib.Path, Look]]) -> tuple[Problems, str | None]:
+    """Return what `examined` does."""
     mixed = accounting.mixed(accounting.makers([meta for _, (_, meta) in looks if meta is not None]))
     return [(path, what) for path, (what, _) in looks if what], mixed and f"{folder}: {mixed}"
 
@@ -193,33 +200,37 @@ def load(folder: pathlib.Path, *, kind: str, space: Space | None = None) -> tupl
       The episodes `[B, ...]` in the order of the shards, and a fingerprint of the data set.
 
     Raises:
-      UserError: no such data set, a shard is missing or damaged, or it holds another kind.
+      UserError: as `opened`; or a shard cannot be read.
     """
-    found = checked(folder, kind=kind)
-    counts = {folder / name: entry["episodes"] for name, entry in found.items()}
-    return _joined(counts, kind=kind, space=space or Space()), fingerprint(found)
+    found = opened(folder, kind=kind)
+    return Episodes([(found, range(len(found)))], space or Space()).whole(), found.fingerprint
 
 
-def _joined(counts: dict[pathlib.Path, int], *, kind: str, space: Space) -> Any:
-    """Return the episodes of shards, read on all cores, one after another in the order of the shards.
+def opened(folder: pathlib.Path, *, kind: str) -> DataSet:
+    """Check every shard of a data set, as `checked` does, and return it; none of its episodes is read.
 
     Args:
-      counts: number of episodes of each.
-      kind: of the episodes.
-      space: where to put them.
+      folder: the data set.
+      kind: a key of `layout.KINDS`.
+
+    Raises:
+      UserError: no such data set, a shard is missing or damaged, or it holds another kind, or shards have different
+        numbers of object slots.
     """
-    (path, *_), ends = counts, np.cumsum(list(counts.values()))
-    first = shards.read_shard(path, kind=kind)
-    whole = space.arrays(int(ends[-1]), first, what="episodes")
-
-    def put(path: pathlib.Path, end: int) -> None:
-        shards.read_shard(path, kind=kind, into=structs.take(whole, slice(end - counts[path], end)))
-        progress.advance(1)
-
-    progress = console.Progress(f"read {kind}", len(counts), unit="shards", quiet=len(counts) < PROGRESS_SHARDS)
-    with progress, concurrent.futures.ThreadPoolExecutor(machine.cores()) as pool:
-        list(pool.map(put, counts, ends))
-    return whole
+    entries, metas = _checked(folder, kind=kind)
+    found: list[Shard] = []
+    for name, entry in entries.items():
+        path = folder / name
+        meta = metas.get(path) or shards.read_meta(path)  # of one that has come since
+        shards.require_kind(path, meta, kind)
+        first = found[0].meta if found else meta
+        if shards.slots(meta) != shards.slots(first):
+            few, many = sorted(map(shards.slots, (meta, first)))
+            said = f"shards with {few} and {many} object slots; want one number in a folder"
+            raise UserError(f"data set {folder}: {said}")
+        columns = first["columns"] if meta["columns"] == first["columns"] else meta["columns"]  # kept once
+        found.append(Shard(path, entry["sha256"], {"columns": columns, "episodes": meta["episodes"]}))
+    return DataSet(kind, tuple(found), shards.empty(kind, found[0].meta), fingerprint(entries))
 
 
 def fingerprint(entries: dict[str, Any]) -> str:
@@ -239,7 +250,12 @@ def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
     Raises:
       UserError: no such data set, or a shard is missing or damaged.
     """
-    found, mixed = _whole(folder, kind=kind)
+    return _checked(folder, kind=kind)[0]
+
+
+def _checked(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], Metas]:
+    """Return the entries of a data set as `checked` does, and the metadata of its shards."""
+    found, metas, mixed = _whole(folder, kind=kind)
     if mixed:
         console.warn(mixed)
     try:
@@ -248,7 +264,7 @@ def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
         said = str(error)
     if said:
         console.warn(said)
-    return found
+    return found, metas
 
 
 def whole(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
@@ -256,9 +272,10 @@ def whole(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
     return _whole(folder, kind=kind)[0]
 
 
-def _whole(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], str | None]:
-    """Return the entries of a data set, and what differs between those who made it; as `checked` otherwise."""
-    problems, mixed = examined(folder)
+def _whole(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], Metas, str | None]:
+    """Return entries and metadata of a data set, and what differs between those who made it; as `checked` otherwise."""
+    looks = _looks(folder)
+    problems, mixed = _said(folder, looks)
     if problems:
         path, what = problems[0]
         raise UserError(
@@ -268,4 +285,4 @@ def _whole(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], str | No
     found = manifest.entries(folder)
     if not found:
         raise UserError(f"data set {folder}: no shards; generate some with dipn-datagen {kind} --out {folder}")
-    return found, mixed
+    return found, {path: meta for path, (_, meta) in looks if meta is not None}, mixed

@@ -183,39 +183,64 @@ def count(path: pathlib.Path) -> int:
     return int(read_meta(path)["episodes"])
 
 
-def read_shard(path: pathlib.Path, *, kind: str, into: Any = None) -> Any:
+def require_kind(path: pathlib.Path, meta: dict[str, Any], kind: str) -> None:
+    """Raise a UserError if a shard with these metadata holds episodes of another kind."""
+    if meta["kind"] != kind:
+        raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
+
+
+def slots(meta: dict[str, Any]) -> int:
+    """Return the number of object slots in a shard with these metadata."""
+    return int(meta["columns"]["scene.shape"]["shape"][0])
+
+
+def empty(kind: str, meta: dict[str, Any]) -> Any:
+    """Return what `read_shard` would of a shard of this kind with these metadata and no episodes: arrays `[0, ...]`."""
+    columns = {
+        name: np.empty((0, *spec["shape"]), np.float32 if "quantum" in spec else spec["dtype"])
+        for name, spec in meta["columns"].items()
+    }
+    return codec.assemble(KINDS[kind], columns)
+
+
+def read_shard(path: pathlib.Path, *, kind: str, sha256: str | None = None, into: Any = None) -> Any:
     """Return the episodes of a shard: a struct of `KINDS[kind]` with a leading `[B]` axis, NumPy arrays.
 
     Args:
       path: the file.
       kind: of its episodes.
+      sha256: digest that the file had when it was checked, in hex; not compared if not given.
       into: a struct like the result, whose arrays the episodes are written to; new ones if not given.
 
     Raises:
-      UserError: see `read_meta`; or the shard is of another kind, or has another number of object slots than `into`.
+      UserError: see `read_meta`; or the shard is of another kind, or is not the file that was checked.
     """
+    with _reading(path):
+        if sha256 is not None and files.file_sha256(path) != sha256:
+            raise UserError(
+                f"shard {path}: was changed since it was checked; leave a data set alone while it is used, and give "
+                "the same command again"
+            )
     meta = read_meta(path)
-    if meta["kind"] != kind:
-        raise UserError(f"shard {path}: holds {meta['kind']} episodes, want {kind}; give another folder")
-    slots = meta["columns"]["scene.shape"]["shape"][0]
-    if into is not None and slots != into.scene.shape.shape[1]:
-        few, many = sorted((slots, into.scene.shape.shape[1]))
-        raise UserError(
-            f"data set {path.parent}: shards with {few} and {many} object slots; want one number in a folder"
-        )
+    require_kind(path, meta, kind)
     with _reading(path):
         return codec.assemble(KINDS[kind], _decoded(path, meta, meta["columns"], into=into))
 
 
-def read_sizes(path: pathlib.Path) -> np.ndarray:
-    """Return the sizes of the objects in the episodes of a shard, `[B, N, 3]` metres, and read nothing else.
+def read_column(path: pathlib.Path, name: str, *, meta: dict[str, Any] | None = None) -> np.ndarray:
+    """Return one leaf of the episodes of a shard, `[B, ...]`, and read nothing else.
+
+    Args:
+      path: the file.
+      name: as `codec.columns` names it, such as `scene.size`; not `after`, which may be stored as a difference.
+      meta: `columns` and `episodes` of its metadata, where these are known; they are read if not given.
 
     Raises:
       UserError: see `read_meta`.
     """
-    meta = read_meta(path)
+    meta = read_meta(path) if meta is None else meta
     with _reading(path):
-        return _decoded(path, meta, ["scene.size"])["scene.size"]
+        return _decoded(path, meta, [name])[name]
 
 
 def _decoded(path: pathlib.Path, meta: dict[str, Any], names: Iterable[str], *, into: Any = None) -> codec.Columns:
@@ -229,7 +254,21 @@ def _decoded(path: pathlib.Path, meta: dict[str, Any], names: Iterable[str], *, 
         flat = column.flatten()
         if column.null_count or flat.null_count:
             raise DamagedShard(path, f"its column {name} has empty places")
-        values = flat.to_numpy(zero_copy_only=False).astype(spec["dtype"], copy="quantum" not in spec)
+        values = _values(flat, np.dtype(spec["dtype"])).astype(spec["dtype"], copy="quantum" not in spec)
         columns[name] = values.reshape(meta["episodes"], *spec["shape"])
     coded = {name: spec for name, spec in specs.items() if "quantum" in spec}
     return codec.decode(columns, coded, into=codec.columns(into) if into is not None else None)
+
+
+def _values(flat: pa.Array, dtype: np.dtype[Any]) -> np.ndarray:
+    """Return the values of an array of Arrow without empty places; its own `to_numpy` imports pandas, which takes long.
+
+    Args:
+      flat: numbers or booleans.
+      dtype: their type, which is that of `flat`.
+    """
+    first, count, data = flat.offset, len(flat), flat.buffers()[1]
+    if dtype.kind == "b":
+        bits = np.unpackbits(np.frombuffer(data, np.uint8), count=first + count, bitorder="little")
+        return bits[first:].view(bool)
+    return np.frombuffer(data, dtype, count=count, offset=first * dtype.itemsize)

@@ -172,8 +172,9 @@ def brief(value: Any) -> str:
 
 def one_line(text: str, *, most: int = 60) -> str:
     """Return a text on one line, of `most` characters at most, all of which can be printed."""
-    text = text.encode("utf-8", "backslashreplace").decode()
-    text = "".join(c if c.isprintable() else "?" for c in text)
+    if not (text.isascii() and text.isprintable()):
+        text = text.encode("utf-8", "backslashreplace").decode()
+        text = "".join(c if c.isprintable() else "?" for c in text)
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from dipn_jax.datagen import cli
 from dipn_jax.datagen.generate import Job, generate
-from dipn_jax.train import split
 from dipn_jax.train.push import PushTask
 
 from dipn_jax.commands import console
 from dipn_jax.networks.dipn import DipnConfig
-from dipn_jax.storage import manifest, records, shards
+from dipn_jax.storage import manifest, on_demand, records, shards
 from dipn_jax.system import files
 from dipn_jax.world import scenes
 
@@ -157,7 +156,7 @@ def test_what_cannot_be_joined_is_one_line(
     refused("shard-00001.parquet are equal: the same scenes twice", *unsaid, *out)
     slower = write(tmp_path / "slower", [episodes[:4]], config | {"actions": 2})
     refused("are both made of seed 0 with number 0: the same scenes twice", push, slower, *out)
-    wider = write(tmp_path / "wider", [split.widened(episodes, 4)], {"seed": 9})
+    wider = write(tmp_path / "wider", [on_demand.widened(episodes, 4)], {"seed": 9})
     files.write_json(wider / "config.json", JOB.describe())
     refused("has number of object slots 3", push, wider, *out)
     with monkeypatch.context() as patch:

@@ -129,7 +129,7 @@ def test_few_sizes_of_batches_are_made(count: int, size: list[int]) -> None:
         return index
 
     ExampleStore(make, 100, space=Space(), about="numbers").take(np.arange(count))
-    assert sizes == [16, *size], "one, to see shapes, and then all"
+    assert sizes == [size[0], *size], "one, to see shapes, by the program that makes the first; and then all"
 
 
 @pytest.mark.parametrize("memory", [0.00001, 1.0])

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import log, split
+from dipn_jax.train import log
 from dipn_jax.train.grasp import SHIFT_PIXELS, GraspTask, PretrainTask, view
 from dipn_jax.train.loop import TrainConfig, fit, make_step
 from dipn_jax.train.online import grasping as online
@@ -16,13 +16,13 @@ from dipn_jax.train.optimizers import make_optimizer
 from dipn_jax.train.push import PushTask
 from flax import nnx
 
-from dipn_jax import geometry, structs
+from dipn_jax import geometry
 from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.planning import candidates
 from dipn_jax.sight import masks, render
-from dipn_jax.storage import checkpoint
+from dipn_jax.storage import checkpoint, on_demand
 from dipn_jax.world import scenes, shapes
 
 SMALL = DipnConfig(width=8)
@@ -134,7 +134,7 @@ def test_grasp_tasks_fit_their_training_data(data: dict[str, pathlib.Path], tmp_
     task = GraspTask((data["grasp"],), config)
     plan = TrainConfig(steps=120, batch=16, learning_rate=5e-3, eval_every=120, save_every=120)
     fit(task, plan, tmp_path / "b", initial=initial)
-    rate = task.train_set.success.mean()
+    rate = task.train_set.whole().success.mean()
     entropy = -(rate * np.log(rate) + (1 - rate) * np.log(1 - rate))
     loss = _loss(task, checkpoint.load_network(tmp_path / "b", network="grasp"), 20)
     assert loss < 0.7 * entropy  # a constant gets 1.0
@@ -172,15 +172,16 @@ def test_learning_online_continues_where_it_was_stopped(engine: Any, tmp_path: p
 
 def test_data_sets_of_different_widths_are_joined(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig())
-    wide = split.widened(task.train_set, 7)
+    learnt = task.train_set.whole()
+    wide = on_demand.widened(learnt, 7)
     assert wide.scene.shape.shape[1] == 7 and (wide.scene.shape[:, 3:] == -1).all()
-    for a, b in zip(task.prepare(wide).height, task.prepare(task.train_set).height, strict=True):
+    for a, b in zip(task.prepare(wide).height, task.prepare(learnt).height, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_the_window_is_centred_on_the_executed_grasp(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig(width=8))
-    episodes = structs.take(task.train_set, np.arange(6))
+    episodes = task.train_set.take(np.arange(6))
     begin = jax.random.randint(jax.random.key(0), (6, 2), 0, 2 * SHIFT_PIXELS)
     images, pixel = view(task.fetch(np.arange(6)), begin)
     height = np.asarray(images)[np.arange(6), pixel[:, 0], pixel[:, 1], 3]
@@ -243,16 +244,16 @@ def test_a_hard_stop_inside_a_line_of_metrics_is_survived(task: PushTask, tmp_pa
 
 def test_no_scene_is_on_both_sides_of_the_split(data: dict[str, pathlib.Path]) -> None:
     task = GraspTask((data["grasp"],), GraspConfig())
-    seen = [{size.tobytes() for size in part.scene.size} for part in (task.train_set, task.test_set)]
+    seen = [{size.tobytes() for size in part.whole().scene.size} for part in (task.train_set, task.test_set)]
     assert not seen[0] & seen[1] and seen[1]
 
 
 def test_an_example_is_the_rendered_scene_and_the_motion_of_the_push(task: PushTask) -> None:
     index = np.array([3, 0])
-    kept, fresh = task.fetch(index), task.prepare(structs.take(task.train_set, index))
+    kept, fresh = task.fetch(index), task.prepare(task.train_set.take(index))
     np.testing.assert_allclose(kept.inputs.crops, fresh.inputs.crops, atol=1e-3)  # kept in half precision
     np.testing.assert_array_equal(kept.target, fresh.target)
-    episode = structs.take(task.train_set, 3)
+    episode = task.train_set.whole()[3]
     _, label = render.render_depth(episode.scene, episode.poses[0])
     centers, area = masks.mask_centers(label, task.slots)
     c, s = np.cos(episode.push.angle), np.sin(episode.push.angle)

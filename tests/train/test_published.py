@@ -88,7 +88,7 @@ def test_the_loss_is_the_mean_over_coordinates_of_pushes_that_are_not_mirrored(t
 
 
 def test_the_learning_curve_shows_the_same_measure(task: push.PushTask) -> None:
-    test = task.prepare(task.test_set)
+    test = task.prepare(task.test_set.whole())
     counted = np.asarray(test.inputs.present[..., None] & test.taught)
     want = _smooth_l1(np.asarray(test.target))[counted].mean()
     np.testing.assert_allclose(task.evaluate(_Still())["held_out_loss"], want, rtol=1e-4)

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from dipn_jax.train import cli, loop, split
+from dipn_jax.train import cli, loop
 from dipn_jax.train.configs import DEFAULT_COMPUTE, TrainConfig
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.push import PushTask
-from dipn_jax.train.split import load_sides, widened
+from dipn_jax.train.split import load_sides
 
 from dipn_jax import structs
 from dipn_jax.commands import console
@@ -19,6 +19,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import manifest, records, shards
+from dipn_jax.storage.on_demand import widened
 from dipn_jax.storage.space import Space
 from dipn_jax.structs import ABSENT
 from dipn_jax.system import files
@@ -43,33 +44,34 @@ def wider(data: Data, tmp_path: pathlib.Path) -> Data:
 
 def test_pushes_of_several_data_sets_are_learnt_from(data: Data, wider: Data) -> None:
     task = PushTask((data["push"], wider["push"]), DipnConfig(), limit=None, centimetres=(5, 10))
-    assert task.size == 40 and len(task.test_set.fault) == 8 and task.slots == 5
-    one, other = (task.prepare(structs.take(task.train_set, slice(at, at + 2))) for at in (0, 20))
+    assert task.size == 40 and len(task.test_set) == 8 and task.slots == 5
+    one, other = (task.prepare(task.train_set.take(slice(at, at + 2))) for at in (0, 20))
     np.testing.assert_array_equal(one.inputs.crops, other.inputs.crops)
     np.testing.assert_array_equal(one.target, other.target)
     assert not np.asarray(one.inputs.present)[:, 3:].any()
     alone = PushTask(data["push"], DipnConfig(), limit=None, centimetres=(5, 10))
     assert task.fingerprint.startswith(alone.fingerprint.split(":")[0]) and task.fingerprint != alone.fingerprint
     fewer = PushTask((data["push"], wider["push"]), DipnConfig(), limit=3, centimetres=(5,))
-    np.testing.assert_array_equal(fewer.train_set.poses, task.train_set.poses[:3])
+    np.testing.assert_array_equal(fewer.train_set.whole().poses, task.train_set.take(slice(0, 3)).poses)
 
 
 def test_the_first_grasps_only_are_learnt_from(data: Data) -> None:
     task = GraspTask(data["grasp"], GraspConfig())
     fewer = GraspTask(data["grasp"], GraspConfig(), limit=3)
     assert fewer.size == 3 and fewer.fingerprint == f"{task.fingerprint}:3"
-    np.testing.assert_array_equal(fewer.train_set.poses, task.train_set.poses[:3])
-    np.testing.assert_array_equal(fewer.test_set.poses, task.test_set.poses)
+    np.testing.assert_array_equal(fewer.train_set.whole().poses, task.train_set.take(slice(0, 3)).poses)
+    np.testing.assert_array_equal(fewer.test_set.whole().poses, task.test_set.whole().poses)
     with pytest.raises(UserError, match="--limit 21: want 1 to 20, the grasps of --data that are not held out"):
         GraspTask(data["grasp"], GraspConfig(), limit=21)
 
 
 def test_the_last_tenth_of_each_is_held_out(data: Data, wider: Data) -> None:
     sides = load_sides((data["push"], wider["push"]), kind="push")
-    half = np.split(sides.held_out.poses, 2)
+    learnt, held_out = sides.learnt.whole(), sides.held_out.whole()
+    half = np.split(held_out.poses, 2)
     np.testing.assert_array_equal(half[0][:, :, :3], half[1][:, :, :3])
-    absent = sides.learnt.scene.shape == ABSENT
-    assert absent[:20, 3:].all() and not sides.learnt.scene.size[absent].any(), "slots that are added are empty"
+    absent = learnt.scene.shape == ABSENT
+    assert absent[:20, 3:].all() and not learnt.scene.size[absent].any(), "slots that are added are empty"
     np.testing.assert_array_equal(half[0][:, :, :3], records.load(data["push"], kind="push")[0].poses[20:])
 
 
@@ -80,27 +82,24 @@ def _in_a_file(array: Any) -> bool:
 
 @pytest.mark.parametrize("several", [False, True])
 def test_what_memory_has_no_room_for_is_the_same_in_files(
-    several: bool, data: Data, wider: Data, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    several: bool, data: Data, wider: Data, tmp_path: pathlib.Path
 ) -> None:
-    monkeypatch.setattr(split, "_COPIED_AT_A_TIME", 7)  # copied in parts
     folders = (data["push"], wider["push"]) if several else data["push"]
-    half = lambda episodes, folder: np.arange(0, len(episodes.fault), 2) if folder == data["push"] else None  # noqa: E731
+    half = lambda of, folder: np.arange(0, len(of), 2) if folder == data["push"] else None  # noqa: E731
     for choose in (lambda *_: None, half):
         sides = load_sides(folders, kind="push", choose=choose)
         mapped = load_sides(folders, kind="push", choose=choose, space=Space(0, tmp_path))
-        assert (mapped.parts, mapped.fingerprint, mapped.slots) == (sides.parts, sides.fingerprint, sides.slots)
+        assert (mapped.parts, mapped.fingerprint) == (sides.parts, sides.fingerprint)
         for one, other in ((sides.learnt, mapped.learnt), (sides.held_out, mapped.held_out)):
-            for leaf, in_file in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-                assert leaf.dtype == in_file.dtype
+            assert one.slots == other.slots
+            for leaf, in_file in zip(jax.tree.leaves(one.whole()), jax.tree.leaves(other.whole()), strict=True):
+                assert leaf.dtype == in_file.dtype and _in_a_file(in_file) and not _in_a_file(leaf)
                 np.testing.assert_array_equal(leaf, in_file)
-        assert _in_a_file(mapped.learnt.poses) and not _in_a_file(sides.learnt.poses)
-        copied = several or choose is half
-        assert (sides.learnt.poses.base is None) == copied, "a whole data set is not copied"
 
 
 def test_images_of_several_data_sets_are_learnt_from(data: Data, wider: Data) -> None:
     task = PretrainTask((data["images"], wider["images"]), GraspConfig(width=8))
-    assert task.size == 6 and task.examples == 8 and len(task.test_set.fault) == 2
+    assert task.size == 6 and task.examples == 8 and len(task.test_set) == 2
 
 
 def test_the_command_takes_several_folders_and_names_the_one_that_is_wrong(
@@ -117,18 +116,35 @@ def test_the_command_takes_several_folders_and_names_the_one_that_is_wrong(
         load_sides((), kind="push")
 
 
-def test_what_one_data_set_holds_out_is_not_learnt_from_another(data: Data, tmp_path: pathlib.Path) -> None:
+def _scenes(episodes: Any) -> list[bytes]:
+    """Return what tells scenes apart: the sizes, masses and frictions of the three objects of each."""
+    leaves = (episodes.scene.size, episodes.scene.mass, episodes.scene.friction)
+    return [b"".join(leaf[:3].tobytes() for leaf in row) for row in zip(*leaves, strict=True)]
+
+
+@pytest.mark.parametrize("slots", [3, 5])
+@pytest.mark.parametrize("every", [1, 2])
+def test_what_one_data_set_holds_out_is_not_learnt_from_another(
+    slots: int, every: int, data: Data, tmp_path: pathlib.Path
+) -> None:
     """The other has the first scenes of one, and less of them, so that it holds out others."""
     episodes = structs.take(records.load(data["push"], kind="push")[0], slice(4, 24))
-    order = np.r_[8:20, 0:8]
+    other = widened(structs.take(episodes, np.r_[8:20, 0:8]), slots)
     (tmp_path / "other").mkdir()
-    shards.write_shard(tmp_path / "other", 0, structs.take(episodes, order), kind="push", config={}, faults={})
+    shards.write_shard(tmp_path / "other", 0, other, kind="push", config={}, faults={})
     manifest.update_manifest(tmp_path / "other")
-    with pytest.raises(
-        UserError, match=r"--data: \d+ episodes would be learnt from whose scenes another of these data sets holds out"
-    ) as said:
-        load_sides((data["push"], tmp_path / "other"), kind="push")
-    assert "\n" not in str(said.value)
+    folders = (data["push"], tmp_path / "other")
+    choose = lambda of, _: None if every == 1 else np.arange(0, len(of), every)  # noqa: E731
+    alone = [load_sides(folder, kind="push", choose=choose) for folder in folders]
+    held = {scene for one in alone for scene in _scenes(one.held_out.whole())}
+    number = sum(scene in held for one in alone for scene in _scenes(one.learnt.whole()))
+    assert number > 1
+    with pytest.raises(UserError) as said:
+        load_sides(folders, kind="push", choose=choose)
+    assert str(said.value) == (
+        f"--data: {number} episodes would be learnt from whose scenes another of these data sets holds out; give one "
+        "of them, or make one with another --seed"
+    )
 
 
 def test_a_mix_belongs_to_a_run_and_runs_without_one_go_on(data: Data, wider: Data, tmp_path: pathlib.Path) -> None:

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from dipn_jax.datagen import cli
 from dipn_jax.datagen.exporting import steps
-from dipn_jax.train.split import split
+from dipn_jax.train.split import load_sides
 
 from dipn_jax.commands import console
 from dipn_jax.sight import render
@@ -100,8 +100,8 @@ def test_names_in_tables_are_plain_and_numbers_are_in_metres(table: pathlib.Path
 
 
 def test_numpy(data: Data, tmp_path: pathlib.Path) -> None:
-    grasps, _ = records.load(data["grasp"], kind="grasp")
-    learnt, held = split(grasps, data["grasp"])
+    sides = load_sides(data["grasp"], kind="grasp")
+    learnt, held = sides.learnt.whole(), sides.held_out.whole()
     out = exported(data, "grasp", tmp_path / "npz", "npz", images="both")
     files = [sorted((out / "data").glob(f"{name}-*.npz")) for name in ("train", "test")]
     for paths, wanted in zip(files, (learnt, held), strict=True):
@@ -150,10 +150,10 @@ def test_a_short_push_stays_where_it_ends() -> None:
 @pytest.mark.parametrize("kind", ["push", "grasp", "images"])
 def test_replay_buffers(kind: str, data: Data, tmp_path: pathlib.Path) -> None:
     zarr = pytest.importorskip("zarr")
-    episodes, _ = records.load(data[kind], kind=kind)
+    sides = load_sides(data[kind], kind=kind)
     out = exported(data, kind, tmp_path / "z", "zarr", images="none" if kind == "push" else "before")
     many = 11 if kind == "push" else 1
-    for name, wanted in zip(("train", "test"), split(episodes, data[kind]), strict=True):
+    for name, wanted in zip(("train", "test"), (sides.learnt.whole(), sides.held_out.whole()), strict=True):
         root = zarr.open_group(out / f"{name}.zarr", mode="r")
         count = len(wanted.fault)
         np.testing.assert_array_equal(root["meta/episode_ends"][:], many * np.arange(1, count + 1))

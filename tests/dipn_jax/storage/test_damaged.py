@@ -128,7 +128,8 @@ def test_a_damaged_shard_is_one_line_wherever_it_is_read_and_is_set_aside(
             assert _command("verify", copy) == 2
             said = capsys.readouterr().err
             assert said.count("\n") == 1 and "run dipn-datagen repair" in said and "shard-00001.parquet" in said
-        _one_line(lambda: PushTask(copy, DipnConfig(), limit=None, centimetres=(10,)), r"run dipn-datagen repair")
+        learn = lambda: PushTask(copy, DipnConfig(), limit=None, centimetres=(10,)).train_set.whole()  # noqa: E731
+        _one_line(learn, r"run dipn-datagen repair")
     _one_line(lambda: shards.read_shard(path, kind="push"), says)
     if damage != "empty places":
         _one_line(lambda: records.summary(copy), says)
