@@ -23,7 +23,7 @@ from dipn_jax.workspace import WORKSPACE
 from dipn_jax.world import shapes
 
 from .example_store import ExampleStore
-from .split import Folders, load_sides
+from .split import Folders, load_split
 
 PRETRAIN_VIEW = 192
 """Pixels of a pre-training view."""
@@ -68,9 +68,9 @@ class PretrainTask:
           config: architecture.
           space: where the scenes are kept; None: in memory.
         """
-        sides = load_sides(data, kind="images", space=space)
-        self.train_set, self.test_set, self.fingerprint = sides.learnt, sides.held_out, sides.fingerprint
-        self.size, self.parts = len(self.train_set), sides.parts
+        split = load_split(data, kind="images", space=space)
+        self.train_set, self.test_set, self.fingerprint = split.learnt, split.held_out, split.fingerprint
+        self.size, self.parts = len(self.train_set), split.parts
         self.examples = self.size + len(self.test_set)
         self.network_config = config
 
@@ -214,9 +214,9 @@ class GraspTask:
           UserError: no folder; one is damaged, or holds something else; or they have fewer episodes.
         """
         space = space or Space()
-        sides = load_sides(data, kind="grasp", what="grasps", limit=limit, space=space)
-        self.train_set, self.test_set, self.parts = sides.learnt, sides.held_out, sides.parts
-        self.fingerprint = sides.fingerprint if limit is None else f"{sides.fingerprint}:{limit}"
+        split = load_split(data, kind="grasp", what="grasps", limit=limit, space=space)
+        self.train_set, self.test_set, self.parts = split.learnt, split.held_out, split.parts
+        self.fingerprint = split.fingerprint if limit is None else f"{split.fingerprint}:{limit}"
         self.size = self.examples = len(self.train_set)
         self.network_config = config
         self.window = WINDOW_PIXELS[config.preset] + 2 * SHIFT_PIXELS

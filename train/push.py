@@ -25,7 +25,7 @@ from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world import shapes
 
 from .example_store import ExampleStore
-from .split import Folders, load_sides
+from .split import Folders, load_split
 
 
 @flax.struct.dataclass
@@ -73,13 +73,13 @@ class PushTask:
             return _chosen(of, folder, centimetres, without)
 
         space = space or Space()
-        sides = load_sides(data, kind="push", what="pushes", choose=choose, limit=limit, space=space)
-        self.train_set, self.test_set, self.parts = sides.learnt, sides.held_out, sides.parts
+        split = load_split(data, kind="push", what="pushes", choose=choose, limit=limit, space=space)
+        self.train_set, self.test_set, self.parts = split.learnt, split.held_out, split.parts
         count = len(self.train_set)
         self.network_config = config
         self.size = self.examples = count
         masks = ("found",) if found else ()
-        self.fingerprint = ":".join(map(str, (sides.fingerprint, count, centimetres, *without, *masks)))
+        self.fingerprint = ":".join(map(str, (split.fingerprint, count, centimetres, *without, *masks)))
         self.centimetres = np.array(centimetres, np.int32)
         self.found = found
         self.slots = self.train_set.slots

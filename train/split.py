@@ -15,14 +15,14 @@ from dipn_jax.storage.space import Space
 
 Folders = pathlib.Path | tuple[pathlib.Path, ...]
 """One data set, or several."""
-Choose = Callable[[DataSet, pathlib.Path], np.ndarray | None]
+ChooseEpisodes = Callable[[DataSet, pathlib.Path], np.ndarray | None]
 """Function of a data set and its folder: the numbers of the episodes that are used, ascending, or None for all."""
 Chosen = list[tuple[DataSet, Rows]]
 """Data sets, each with the numbers of some of its episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Sides:
+class Split:
     """Episodes of one data set or of several, split; none of them has been read."""
 
     learnt: Episodes
@@ -31,15 +31,15 @@ class Sides:
     fingerprint: str
 
 
-def load_sides(
+def load_split(
     data: Folders,
     *,
     kind: str,
     what: str = "episodes",
-    choose: Choose = lambda *_: None,
+    choose: ChooseEpisodes = lambda *_: None,
     limit: int | None = None,
     space: Space | None = None,
-) -> Sides:
+) -> Split:
     """Check data sets and split each; they may have different numbers of object slots.
 
     Args:
@@ -68,7 +68,7 @@ def load_sides(
     parts = _first(cuts, limit, what=what)
     learnt = [(of, rows[:part]) for (of, rows), part in zip(learnt, parts, strict=True)]
     space = space or Space()
-    return Sides(Episodes(learnt, space), Episodes(held, space), parts, ":".join(of.fingerprint for of in sets))
+    return Split(Episodes(learnt, space), Episodes(held, space), parts, ":".join(of.fingerprint for of in sets))
 
 
 def _cut(of: DataSet, rows: Rows, folder: pathlib.Path) -> int:

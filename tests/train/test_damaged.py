@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from dipn_jax.train import order
+from dipn_jax.train import example_order
 from dipn_jax.train.loop import TrainConfig, fit
 from dipn_jax.train.push import PushTask
 
@@ -48,7 +48,7 @@ def test_a_damaged_shard_ends_the_training_that_uses_it_and_what_was_saved_is_wh
     held_out: bool, folder: pathlib.Path, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One that is learnt from is read by the thread that fetches ahead; those that are held out, when it evaluates."""
-    seen = np.concatenate([np.asarray(order.batches((20,), PLAN)[step]) // 4 for step in range(PLAN.steps)])
+    seen = np.concatenate([np.asarray(example_order.batches((20,), PLAN)[step]) // 4 for step in range(PLAN.steps)])
     fatal = next(step for step in range(2, PLAN.steps) if seen[step] not in seen[:step])
     damaged = shards.shard_path(folder, 5 if held_out else int(seen[fatal]))
     _damage(damaged)

@@ -11,7 +11,7 @@ from dipn_jax.train import cli, loop
 from dipn_jax.train.configs import DEFAULT_COMPUTE, TrainConfig
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.push import PushTask
-from dipn_jax.train.split import load_sides
+from dipn_jax.train.split import load_split
 
 from dipn_jax import structs
 from dipn_jax.commands import console
@@ -66,7 +66,7 @@ def test_the_first_grasps_only_are_learnt_from(data: Data) -> None:
 
 
 def test_the_last_tenth_of_each_is_held_out(data: Data, wider: Data) -> None:
-    sides = load_sides((data["push"], wider["push"]), kind="push")
+    sides = load_split((data["push"], wider["push"]), kind="push")
     learnt, held_out = sides.learnt.whole(), sides.held_out.whole()
     half = np.split(held_out.poses, 2)
     np.testing.assert_array_equal(half[0][:, :, :3], half[1][:, :, :3])
@@ -87,8 +87,8 @@ def test_what_memory_has_no_room_for_is_the_same_in_files(
     folders = (data["push"], wider["push"]) if several else data["push"]
     half = lambda of, folder: np.arange(0, len(of), 2) if folder == data["push"] else None  # noqa: E731
     for choose in (lambda *_: None, half):
-        sides = load_sides(folders, kind="push", choose=choose)
-        mapped = load_sides(folders, kind="push", choose=choose, space=Space(0, tmp_path))
+        sides = load_split(folders, kind="push", choose=choose)
+        mapped = load_split(folders, kind="push", choose=choose, space=Space(0, tmp_path))
         assert (mapped.parts, mapped.fingerprint) == (sides.parts, sides.fingerprint)
         for one, other in ((sides.learnt, mapped.learnt), (sides.held_out, mapped.held_out)):
             assert one.slots == other.slots
@@ -113,7 +113,7 @@ def test_the_command_takes_several_folders_and_names_the_one_that_is_wrong(
     assert "--mix 1: want a number for each folder of --data, 2" in capsys.readouterr().err
     assert not (tmp_path / "r" / "config.json").exists()
     with pytest.raises(UserError, match="want at least one folder of dipn-datagen push"):
-        load_sides((), kind="push")
+        load_split((), kind="push")
 
 
 def _scenes(episodes: Any) -> list[bytes]:
@@ -135,12 +135,12 @@ def test_what_one_data_set_holds_out_is_not_learnt_from_another(
     manifest.update_manifest(tmp_path / "other")
     folders = (data["push"], tmp_path / "other")
     choose = lambda of, _: None if every == 1 else np.arange(0, len(of), every)  # noqa: E731
-    alone = [load_sides(folder, kind="push", choose=choose) for folder in folders]
+    alone = [load_split(folder, kind="push", choose=choose) for folder in folders]
     held = {scene for one in alone for scene in _scenes(one.held_out.whole())}
     number = sum(scene in held for one in alone for scene in _scenes(one.learnt.whole()))
     assert number > 1
     with pytest.raises(UserError) as said:
-        load_sides(folders, kind="push", choose=choose)
+        load_split(folders, kind="push", choose=choose)
     assert str(said.value) == (
         f"--data: {number} episodes would be learnt from whose scenes another of these data sets holds out; give one "
         "of them, or make one with another --seed"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from dipn_jax.train.grasp import GraspTask, PretrainTask
 from dipn_jax.train.push import PushTask
-from dipn_jax.train.split import load_sides
+from dipn_jax.train.split import load_split
 
 from dipn_jax import structs
 from dipn_jax.errors import UserError
@@ -106,7 +106,7 @@ def test_both_sides_are_those_of_reading_whole(
     choose = _odd if chosen else lambda *_: None
     space = Space(0, tmp_path / "files") if in_files else None
     limit = None if less is None else sum(_reference(folders, chosen, None)[2]) - less
-    sides = load_sides(folders, kind="push", choose=choose, limit=limit, space=space)
+    sides = load_split(folders, kind="push", choose=choose, limit=limit, space=space)
     learnt, held, parts = _reference(folders, chosen, limit)
     assert sides.parts == tuple(parts) and len(sides.learnt) == sum(parts) == len(learnt.fault)
     index = np.random.default_rng(0).permutation(len(learnt.fault))[:5]
@@ -118,8 +118,8 @@ def test_both_sides_are_those_of_reading_whole(
 def test_a_limit_is_one_of_what_is_learnt_from(two: tuple[pathlib.Path, ...]) -> None:
     for limit in (0, 37):
         with pytest.raises(UserError, match=f"--limit {limit}: want 1 to 36, the pushes of --data that are not held"):
-            load_sides(two, kind="push", what="pushes", limit=limit)
-    assert load_sides(two, kind="push", limit=36).parts == (20, 16)
+            load_split(two, kind="push", what="pushes", limit=limit)
+    assert load_split(two, kind="push", limit=36).parts == (20, 16)
 
 
 def _noted(monkeypatch: pytest.MonkeyPatch) -> list[str]:

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from dipn_jax.datagen import cli
 from dipn_jax.datagen.exporting import columns, export, rendering, source
-from dipn_jax.train.split import load_sides
+from dipn_jax.train.split import load_split
 
 from dipn_jax.commands import console
 from dipn_jax.sight import render
@@ -40,7 +40,7 @@ def needs(form: str) -> None:
 def test_splits_are_those_of_training_and_scenes_are_numbered(kind: str, data: Data) -> None:
     found = source.open_source(data[kind])
     episodes, fingerprint = records.load(data[kind], kind=kind)
-    sides_of_training = load_sides(data[kind], kind=kind)
+    sides_of_training = load_split(data[kind], kind=kind)
     learnt, held = sides_of_training.learnt.whole(), sides_of_training.held_out.whole()
     assert found.fingerprint == fingerprint and found.count == len(episodes.fault)
     sides = {name: [found.read(part) for part in found.parts() if part.split == name] for name in source.SPLITS}

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from dipn_jax.datagen import cli
 from dipn_jax.datagen.exporting import steps
-from dipn_jax.train.split import load_sides
+from dipn_jax.train.split import load_split
 
 from dipn_jax.commands import console
 from dipn_jax.sight import render
@@ -100,7 +100,7 @@ def test_names_in_tables_are_plain_and_numbers_are_in_metres(table: pathlib.Path
 
 
 def test_numpy(data: Data, tmp_path: pathlib.Path) -> None:
-    sides = load_sides(data["grasp"], kind="grasp")
+    sides = load_split(data["grasp"], kind="grasp")
     learnt, held = sides.learnt.whole(), sides.held_out.whole()
     out = exported(data, "grasp", tmp_path / "npz", "npz", images="both")
     files = [sorted((out / "data").glob(f"{name}-*.npz")) for name in ("train", "test")]
@@ -150,7 +150,7 @@ def test_a_short_push_stays_where_it_ends() -> None:
 @pytest.mark.parametrize("kind", ["push", "grasp", "images"])
 def test_replay_buffers(kind: str, data: Data, tmp_path: pathlib.Path) -> None:
     zarr = pytest.importorskip("zarr")
-    sides = load_sides(data[kind], kind=kind)
+    sides = load_split(data[kind], kind=kind)
     out = exported(data, kind, tmp_path / "z", "zarr", images="none" if kind == "push" else "before")
     many = 11 if kind == "push" else 1
     for name, wanted in zip(("train", "test"), (sides.learnt.whole(), sides.held_out.whole()), strict=True):
