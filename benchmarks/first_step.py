@@ -29,15 +29,15 @@ import sys
 
 from dipn_jax.train import cli, devices
 
-own, given = devices.OneDevice.share, []
+own, given = devices.OneDevice.shard_batch, []
 
-def share(self, examples):
+def shard_batch(self, examples):
     given.append(1)
     if len(given) == 2:
         print("second batch", file=sys.stderr, flush=True)
     return own(self, examples)
 
-devices.OneDevice.share = share
+devices.OneDevice.shard_batch = shard_batch
 cli.main()
 """
 """`dipn-train`, which says when it has computed a step and hands the next batch over."""

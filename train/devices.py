@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import json
 import os
 import re
 import socket
@@ -57,6 +58,13 @@ class OneDevice:
     def wait(self, name: str) -> None:
         """Wait until all processes are at the place `name`."""
 
+    def require_alike(self, given: dict[str, Any], *, what: str) -> None:
+        """Check that all processes give the same dictionary, which has to fit into JSON; `what` says of what it is.
+
+        Raises:
+          UserError: they do not; in every process.
+        """
+
 
 class Shared(OneDevice):
     """Steps whose batches are shared by several devices, each of which has all parameters.
@@ -105,6 +113,23 @@ class Shared(OneDevice):
         """See `OneDevice`."""
         if jax.process_count() > 1:
             multihost_utils.sync_global_devices(name)
+
+    def require_alike(self, given: dict[str, Any], *, what: str) -> None:
+        """See `OneDevice`."""
+        if jax.process_count() == 1:
+            return
+        text = np.frombuffer(json.dumps(given).encode(), np.uint8)
+        lengths = multihost_utils.process_allgather(np.asarray(len(text)))
+        padded = np.pad(text, (0, lengths.max() - len(text)))
+        texts = multihost_utils.process_allgather(padded)
+        first, *others = (json.loads(one[:length].tobytes()) for one, length in zip(texts, lengths, strict=True))
+        for number, other in enumerate(others, 1):
+            if names := [name for name in {**first, **other} if first.get(name) != other.get(name)]:
+                values = ", ".join(f"{typed.one_line(str(one.get(names[0])), most=80)}" for one in (first, other))
+                raise UserError(
+                    f"--data-parallel: {names[0]} of processes 0 and {number} of this job differ ({values}): {what}; "
+                    "give all processes the same"
+                )
 
 
 def placement(compute: Compute, *, batch: int) -> OneDevice:

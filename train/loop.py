@@ -167,10 +167,13 @@ def _fit(
 ) -> dict[str, float]:
     """Train in a folder that this process owns, or its leader; arguments as of `fit`."""
     model = initial or checkpoint.build(task.network, task.network_config, seed=config.seed)
+    identity = _identity(task, config, compute, initial)
+    where.require_alike(identity, what="options, or folders of data")
     if where.leads:
-        _claim(out, _identity(task, config, compute, initial), config)
+        _claim(out, identity, config)
     where.wait("claimed")
     moments, begin, best = _resume(out, model, optimizer)
+    where.require_alike({"step": begin}, what="the step to continue at; is --out one folder for all?")
     graph, *state = _split(model)
     params, rest, moments = where.replicate((*state, moments))
     batches = example_order.batches(task.parts, config)

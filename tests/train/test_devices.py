@@ -36,17 +36,21 @@ from dipn_jax.train import devices
 from dipn_jax.train.configs import Compute, TrainConfig
 
 data, out, sent = sys.argv[1:]
+limit = None
 console.enable_compilation_cache()
 compute = Compute(data_parallel=True)
 import functools, jax, os, signal
 jax.distributed.initialize = functools.partial(jax.distributed.initialize, heartbeat_timeout_seconds=10)
 devices.join(compute)
+from dipn_jax.errors import UserError
 from dipn_jax.train.loop import fit
 from dipn_jax.train.push import PushTask
 
 assert jax.device_count() == 4 and jax.local_device_count() == 2
-task = PushTask(pathlib.Path(data), DipnConfig(width=8), limit=None, centimetres=(5, 10))
-own, shared = devices.Shared.share, []
+if sent == "other data" and jax.process_index():
+    limit = 8
+task = PushTask(pathlib.Path(data), DipnConfig(width=8), limit=limit, centimetres=(5, 10))
+own, shared = devices.Shared.shard_batch, []
 
 def shard_batch(self, examples):
     shared.append(len(examples.taught))
@@ -54,15 +58,20 @@ def shard_batch(self, examples):
         os.kill(os.getpid(), signal.Signals[sent])
     return own(self, examples)
 
-devices.Shared.share = share
+devices.Shared.shard_batch = shard_batch
 plan = TrainConfig(steps=12, batch=4, learning_rate=1e-4, optimizer="sgd", eval_every=4, save_every=4)
 try:
     fit(task, plan, pathlib.Path(out), compute=compute)
 except KeyboardInterrupt:
     sys.exit(0 if shared == [2] * devices.SYNC_EVERY else 1)
+except UserError as error:
+    sys.exit(2 if "data of processes 0 and 1 of this job differ" in str(error) else 1)
 sys.exit("was not interrupted")
 """
-"""DIPN learns on four devices of two processes; the second one gets a signal at its fifth step, which ends both."""
+"""DIPN learns on four devices of two processes; the second one gets a signal at its fifth step, which ends both.
+
+With "other data" in the place of a signal, the second process learns from other episodes.
+"""
 
 
 ONE_PROCESS = """
@@ -143,6 +152,14 @@ def test_a_process_that_is_killed_ends_the_others_and_nothing_saved_is_lost(
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["00000004"]
     fit(task, WHOLE, tmp_path)
     _check(files.read_lines(tmp_path / "metrics.jsonl"), alone)
+
+
+@pytest.mark.slow
+def test_processes_with_other_data_are_told_so_before_anything_is_written(
+    data: dict[str, pathlib.Path], tmp_path: pathlib.Path
+) -> None:
+    assert _start(data["push"], tmp_path / "run", "other data") == (2, 2)
+    assert not (tmp_path / "run" / "config.json").exists()
 
 
 @pytest.mark.slow
