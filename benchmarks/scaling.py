@@ -26,8 +26,8 @@ COLUMNS = {
 def costs(kept: dict[str, Any]) -> str:
     """Return the table of what a million episodes cost by kind and number of objects.
 
-    On more cores it is as many times quicker: shards share nothing. `kept` is a file of `python -m benchmarks --out`,
-    or several of one machine merged by hand, as `page.origins` takes them.
+    On more cores it is as many times quicker, as long as there are shards for all: they share nothing. `kept` is a file
+    of `python -m benchmarks --out`, or several of one machine merged by hand, as `page.origins` takes them.
     """
     machines = kept["machine"] if isinstance(kept["machine"], list) else [kept["machine"]]
     cores, rows = machines[0]["cores"], []
@@ -35,10 +35,10 @@ def costs(kept: dict[str, Any]) -> str:
         if name.startswith("rates.native/"):
             _, kind, objects = name.split("/")
             hours = MILLION / rate / 3600 * cores
-            cells = [f"{rate:.3g}", f"{hours:.3g}", f"{hours / 100:.2g} h", f"{60 * hours / 10_000:.2g} min"]
+            cells = [f"{rate:.3g}", f"{hours:.3g}", f"{hours / 100:.2g} h", f"{SHARD * cores / rate:.2g} s"]
             rows.append([kind, objects, *cells, f"{10_000 * rate / cores / SHARD:.3g}"])
-    head = ["kind", "objects", f"episodes a second, {cores} cores", "core-hours a million", "on 100 cores"]
-    return markdown.table([*head, "on 10,000 cores", "shards a second then"], rows)
+    head = ["kind", "objects", f"episodes a second, {cores} cores", "core-hours a million"]
+    return markdown.table([*head, "a million on 100 cores", "a shard on one", "shards a second on 10,000"], rows)
 
 
 def overheads(kept: dict[str, Any]) -> str:

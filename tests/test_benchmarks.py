@@ -96,4 +96,4 @@ def test_costs_are_of_a_core_and_fall_with_their_number() -> None:
         "figures": {"rates.native/push/7": 100.0, "jobs.overhead/ray/1000/milliseconds": 3.0},
     }
     # 10,000 s of two cores; 10,000 cores make 500,000 a second, in shards of 500
-    assert "| push | 7 | 100 | 5.56 | 0.056 h | 0.033 min | 1e+03 |" in scaling.costs(kept)
+    assert "| push | 7 | 100 | 5.56 | 0.056 h | 10 s | 1e+03 |" in scaling.costs(kept)
