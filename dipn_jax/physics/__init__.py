@@ -1,6 +1,6 @@
 """One interface, three engines: `native` (MuJoCo C on CPU threads), `mjx` (XLA: GPU, TPU, CPU) and `warp` (NVIDIA).
 
-`mjx_warp` is `mjx` with the solver of `blocks`.
+`mjx_warp` is `mjx` with the collision of `narrow` and the solver of `blocks`.
 
 All read the same MJCF (`dipn_jax.world.model`), take the same arguments and return the same result, so which
 one runs is a configuration value.
