@@ -147,7 +147,7 @@ if (is_plane) {
     }
     limit = TOUCHING - shared.best(lowest).value;
     lift = -0.5f;
-    shared.sync();
+    shared.sync();  // `best` does not wait for shared memory on a GPU
 } else {
     shared.place(0, vertex.data + 3 * VERTICES * first, face_normal.data + 3 * FACES * first, turn, shift);
     Best gap_a { -INFINITY, 0 }, gap_b { -INFINITY, 0 };

@@ -54,7 +54,7 @@
             s.height[2 * i] = inside && height_p < -CLIP_SLACK ? height_p : APART;
             s.height[2 * i + 1] = inside && height_q < -CLIP_SLACK ? height_q : APART;
         }
-        sync();
+        sync();  // `best` does not wait for shared memory on a GPU
         return 2 * count;
     }
 
