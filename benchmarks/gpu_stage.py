@@ -56,7 +56,8 @@ class Size:
     heap_seconds: float = 0.2  # for which falling heaps are simulated
     shard: int = 2790  # push episodes: 1,024 scenes
     least_seconds: float = 15.0  # that a data set has to take for its rate to count
-    variants: int = 100  # of each engine's settings, the first of them
+    variants: int = 100  # of MuJoCo Warp's settings, the first of them
+    mjx_variants: int = 100  # likewise of MJX's
     tables: int = 64  # decided on at once
     candidates: int = 64  # pushes considered a table
     cases: int = 10  # hard tables on which one action is made
@@ -89,6 +90,7 @@ def size_of(*, toy: bool, seed: int) -> Size:
         shard=2,
         least_seconds=0.0,
         variants=1,
+        mjx_variants=3,  # the Warp kernels are in the rehearsal
         tables=1,
         candidates=4,
         cases=1,

@@ -1,6 +1,6 @@
 """One interface, four engines: `native` (MuJoCo C on CPU threads), `mjx` (XLA: GPU, TPU, CPU), `mjx_warp`, `warp`.
 
-`mjx_warp` is `mjx` with the solver of `blocks`; `warp` is MuJoCo Warp, for NVIDIA GPUs.
+`mjx_warp` is `mjx` with the collision of `narrow` and the solver of `blocks`; `warp` is MuJoCo Warp, for NVIDIA GPUs.
 
 All read the same MJCF (`dipn_jax.world.model`), take the same arguments and return the same result, so which
 one runs is a configuration value.

@@ -5,7 +5,8 @@ contact touches 12 columns. The kernel (`blocks_kernel.py`, made of C++ by NVIDI
 arms and the two bodies instead, leaves out contacts that do not touch, and factors a Hessian of blocks of 6 x 6: the
 hand is one (x, y, z, yaw, two fingers), each object another. The cost that it minimizes is that of `cone`.
 
-It is an option of the engine `mjx` (`PhysicsConfig.solver`). On a CPU the same source runs with one thread.
+It is an option of the engine `mjx` (`PhysicsConfig.solver`), together with the collision of `narrow`. On a CPU the same
+source runs with one thread.
 """
 
 from __future__ import annotations

@@ -146,12 +146,14 @@ class Program:
             "body_inertia": base.body_inertia.at[b].set(inertia),
             "body_invweight0": base.body_invweight0.at[b].set(light),
             "dof_invweight0": base.dof_invweight0.at[GRIPPER_DOF:].set(light.repeat(3, -1).reshape(-1)),
-            "_impl.mesh_convex": (jax.tree.map(self._per_geom, flat.mesh),),
+            "_impl.mesh_convex": (self._hulls(flat.mesh),),
         }
 
-    def _per_geom(self, leaf: jax.Array) -> jax.Array:
-        """Return `leaf [3 N, ...]` after rows of zeros for the geoms that are no part of an object."""
-        return jnp.concatenate([jnp.zeros((self.first_geom, *leaf.shape[1:]), leaf.dtype), leaf])
+    def _hulls(self, parts: Any) -> Any:
+        """Return the hulls of all geoms: of the gripper's boxes (`narrow` reads them), then `parts [3 N, ...]`."""
+        sides = 2 * self.base.geom_size[: self.first_geom]
+        boxes = jax.vmap(functools.partial(prisms.parts, shapes.CLASSES.index("cuboid")))(sides).mesh
+        return jax.tree.map(lambda box, part: jnp.concatenate([box[:, 0], part]), boxes, parts)
 
     def _tick(self, fields: dict[str, Any], state: State, ctrl: jax.Array, force: jax.Array) -> State:
         """Advance one scene by one control period."""

@@ -3,7 +3,7 @@
 MJX cannot be given another solver or other colliders, so `register` replaces functions in its modules:
 
 - `solver.solve`, by `cone.solve` or, where the MJCF says so, `blocks.solve`: contacts with elliptic friction cones;
-- the colliders of meshes with planes, boxes and meshes, by `colliders.collide`.
+- the colliders of meshes with planes, boxes and meshes, by `colliders.collide` or, likewise, `narrow.collide`.
 
 Every replacement looks at the model first. A model that was not made from our MJCF (`world.model.mjcf`) is passed on to
 MJX's own function, so other users of MJX in the same process get the results that they would get without us.
@@ -19,7 +19,7 @@ from mujoco.mjx._src import collision_driver, solver
 from mujoco.mjx._src.types import GeomType
 
 from dipn_jax.errors import UserError
-from dipn_jax.physics import blocks, colliders, cone
+from dipn_jax.physics import blocks, colliders, cone, narrow
 from dipn_jax.world import model
 
 _PATCHED_PAIRS = tuple((kind, GeomType.MESH) for kind in (GeomType.PLANE, GeomType.BOX, GeomType.MESH))
@@ -72,7 +72,8 @@ def _collider(upstream: Callable[..., Any]) -> Callable[..., Any]:
 
     def collide(m: Any, d: Any, key: Any, geom: jax.Array) -> Any:
         if is_ours(m) and colliders.is_traced(m, key):
-            return colliders.collide(m, d, key, geom)
+            ours = narrow if _has_number(m, model.WARP_MARK) else colliders
+            return ours.collide(m, d, key, geom)
         return upstream(m, d, key, geom)
 
     collide.ncon = upstream.ncon  # type: ignore[attr-defined]  # MJX reads it

@@ -18,7 +18,7 @@ from dipn_jax.world import shapes
 MARK = "dipn_jax"
 """Name of a custom number in our MJCF that marks a model as ours (`physics.patches` looks for it)."""
 WARP_MARK = "dipn_jax_warp"
-"""Name of a custom number in models that the engine `mjx` is to solve by its Warp kernel (`PhysicsConfig.solver`)."""
+"""Name of a custom number in models whose contacts the engine `mjx` leaves to Warp kernels (`PhysicsConfig.solver`)."""
 GRIPPER_DOF = 6
 """Degrees of freedom of the gripper: x, y, z, yaw, two fingers. Each object follows with 7 qpos and 6 qvel."""
 OBJECT_FRICTION_RATIO = 0.5 / 0.35

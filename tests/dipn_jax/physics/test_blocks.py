@@ -14,17 +14,15 @@ from mujoco.mjx._src import forward
 
 from dipn_jax import physics
 from dipn_jax.errors import UserError
-from dipn_jax.physics import blocks, cone, mjx, native, patches
+from dipn_jax.physics import blocks, cone, mjx, patches
 from dipn_jax.physics.mjx_program import Program
-from dipn_jax.structs import Push, Scene
-from dipn_jax.world import clutter, primitives, scenes
+from dipn_jax.structs import Scene
+from dipn_jax.world import primitives
 
 pytestmark = pytest.mark.slow
 BLOCKS = 4
 CONTACTS = 9
 ROWS = 3
-FIVE_CENTIMETRES = 5
-"""Sample of a push at which it has gone that far."""
 STATIC_SHARED_MEMORY = 48 * 1024
 """Bytes that a CUDA kernel may have without asking at run time."""
 MOST_REGISTERS = 128
@@ -217,24 +215,6 @@ def test_on_a_gpu_nothing_is_spilled_and_its_shared_memory_is_static(
     assert used.stack == 0, "registers or arrays are in local memory"
     assert used.registers <= MOST_REGISTERS
     assert 0 < used.shared <= STATIC_SHARED_MEMORY
-
-
-def test_pushes_end_where_mujoco_c_puts_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    solved, own = [], blocks.solve
-    monkeypatch.setattr(blocks, "solve", lambda m, d: solved.append(m.nv) or own(m, d))
-    ours = physics.make_engine("mjx_warp")
-    reference = native.NativeEngine(ours.config)
-    items = clutter.settled_scenes(jax.random.key(1), reference, scenes.fixed_count(2), 4)
-    behind = items.poses[:, 0, :2] - np.array([0.05, 0.0], np.float32)
-    path = primitives.push_trajectory(Push(behind, np.zeros(4, np.float32), np.full(4, 0.1, np.float32)))
-    until = primitives.push_samples()[: FIVE_CENTIMETRES + 1]
-    found, wanted = (engine.simulate(items.scene, items.poses, path, until) for engine in (ours, reference))
-    moved = np.linalg.norm(wanted.poses[:, -1, :, :3] - items.poses[..., :3], axis=-1)
-    assert (moved.max(-1) > 0.01).all()
-    apart = np.linalg.norm(found.poses[:, -1, :, :3] - wanted.poses[:, -1, :, :3], axis=-1)[moved > 0.001]
-    assert set(solved) == {18}, "two objects and the hand, by the kernel"
-    assert np.median(apart) < 0.001 and apart.max() < 0.003
-    np.testing.assert_array_equal(found.fault, wanted.fault)
 
 
 def test_without_warp_it_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""MJX compared with MuJoCo C: the same contacts, the same episodes, one program for everything."""
+"""MJX compared with MuJoCo C: the same episodes, by XLA and by the kernels of Warp, one program for everything."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
+from mujoco.mjx._src.types import GeomType
 
-from dipn_jax import geometry
 from dipn_jax.errors import UserError
-from dipn_jax.physics import colliders, mjx, prisms
+from dipn_jax.physics import blocks, mjx, narrow
 from dipn_jax.physics.mjx import MjxEngine
 from dipn_jax.physics.native import NativeEngine
 from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
-from dipn_jax.world import model, primitives, scenes, shapes
+from dipn_jax.world import primitives, scenes, shapes
 
 pytestmark = pytest.mark.slow
 BATCH = 4  # scenes that the program takes
@@ -30,10 +29,8 @@ SLOTS = 3  # object slots of a scene
 POSITION_TOLERANCE = 0.003
 """Metres between the engines after 5 cm of a push: float32 and another solver. On 32 random scenes (docs/world.md) the
 90th percentile is 1.3 mm, as contacts between objects multiply differences."""
-DEPTH_TOLERANCE = 1e-4
-"""Metres of contact depth; `colliders.FACE_PREFERENCE` is 0.05 mm of it. Measured: 1e-8 on these pairs."""
-DEEPEST = 0.003
-"""Metres: deeper than any contact of an episode. Far deeper, clipping a face can cut off the deepest corner."""
+FALL_SECONDS = 0.1
+"""Seconds in which a heap falls: its objects hit one another, and engines are 1 mm apart (10 mm at 0.2 s)."""
 CLASS = {name: i for i, name in enumerate(shapes.CLASSES)}
 SIZES = {
     "cuboid": (0.06, 0.05, 0.04),
@@ -140,6 +137,48 @@ def test_grasps_of_isolated_objects_agree_in_the_same_program(
     assert engine.programs == compiled and len(compiled) == 1  # the one that pushed
 
 
+def test_the_kernels_of_warp_push_and_drop_as_xla_and_mujoco_c_do(
+    engine: MjxEngine,
+    reference: NativeEngine,
+    settled: tuple[Scene, np.ndarray],
+    pushed: tuple[Push, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    used = set()
+
+    def noting(module: Any, name: str) -> None:
+        own = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda m, d, *rest: used.add((name, *rest[:1])) or own(m, d, *rest))
+
+    noting(narrow, "collide")
+    noting(blocks, "solve")
+    kernels = MjxEngine(dataclasses.replace(engine.config, solver="warp"))
+    scene, poses = settled
+    push, by_xla = pushed
+    found = primitives.push(kernels, scene, poses, push)
+    kinds = {key.types[0] for name, *keys in used for key in keys}
+    assert kinds == {GeomType.PLANE, GeomType.BOX, GeomType.MESH} and ("solve",) in used
+    wanted, at, present = primitives.push(reference, scene, poses, push), 5, scene.shape >= 0
+    for other, most in ((by_xla, 0.001), (wanted, POSITION_TOLERANCE)):
+        apart = np.linalg.norm(found.poses[:, at, :, :3] - other.poses[:, at, :, :3], axis=-1)[present]
+        assert apart.max() < most, apart
+        np.testing.assert_array_equal(found.fault & ~Fault.UNSETTLED, other.fault & ~Fault.UNSETTLED)
+
+    turn = np.float32([0, 0, 0, 0, 0.3, 0.2, 0.1])
+    heap = np.where(present[..., None], poses + turn, poses)
+    heap[..., 3:] /= np.linalg.norm(heap[..., 3:], axis=-1, keepdims=True)
+    for s in range(1, SLOTS):  # each on the one before it
+        heap[:, s, :3] = np.where(present[:, s, None], heap[:, s - 1, :3] + [0.01, 0.01, 0.09], heap[:, s, :3])
+    found, by_xla, wanted = (
+        primitives.settle(e, scene, heap, duration=FALL_SECONDS) for e in (kernels, engine, reference)
+    )
+    fallen = np.linalg.norm(wanted.poses[:, 0, :, :3] - heap[..., :3], axis=-1)[present]
+    assert (fallen > 0.005).all()
+    for other, most in ((by_xla, 1e-4), (wanted, POSITION_TOLERANCE)):
+        apart = np.linalg.norm(found.poses[:, 0, :, :3] - other.poses[:, 0, :, :3], axis=-1)[present]
+        assert apart.max() < most, apart
+
+
 def test_a_fault_stays_in_its_episode(engine: MjxEngine, settled: tuple[Scene, np.ndarray]) -> None:
     scene, poses = settled
     clean = primitives.settle(engine, scene, poses, duration=0.1)
@@ -239,61 +278,3 @@ def test_pairs_that_are_left_out_are_a_fault(engine: MjxEngine) -> None:
 def test_a_timestep_that_does_not_divide_the_control_period_is_refused() -> None:
     with pytest.raises(UserError, match=r"timestep 0\.004"):
         MjxEngine(dataclasses.replace(mjx.DEFAULTS, timestep=0.004))
-
-
-def _random_pairs(count: int) -> tuple[Scene, np.ndarray]:
-    """Return pairs of objects of all classes that overlap a little or nearly; the first also cuts the table."""
-    keys = jax.random.split(jax.random.key(0), 3)
-    shape = np.stack([np.arange(count) % 5, (np.arange(count) // 5) % 5], -1).astype(np.int32)
-    size = np.array([[SIZES[shapes.CLASSES[c]] for c in row] for row in shape], np.float32)
-    quat = np.asarray(jax.vmap(jax.vmap(geometry.random_quat))(jax.random.split(keys[0], (count, 2))))
-    direction = np.asarray(jax.random.normal(keys[1], (count, 3)))
-    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-    gap = np.asarray(jax.random.uniform(keys[2], (count, 1), minval=0.035, maxval=0.055))
-    position = np.stack([np.zeros((count, 3)), direction * gap], 1) + np.array([0.0, 0.0, 0.025])
-    full = np.full(shape.shape, 0.35, np.float32)
-    return Scene(shape, size, np.zeros_like(size), full, full), np.concatenate([position, quat], -1).astype(np.float32)
-
-
-@jax.jit
-def _depths(scene: Scene, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return least distances between parts `[B, P, P]` (1: apart) and of the first object's parts to the table."""
-    parts = jax.vmap(jax.vmap(prisms.parts))(scene.shape, scene.size)
-    turn = geometry.quat_to_matrix(poses[..., 3:])
-    pos = poses[..., None, :3] + jnp.einsum("bnij,bnpj->bnpi", turn, parts.center)
-    mat = jnp.broadcast_to(turn[:, :, None], (*pos.shape, 3))
-    size = jnp.broadcast_to(parts.alive[..., None], pos.shape).astype(jnp.float32)
-    hulls = colliders.ConvexInfo(pos, mat, size, **vars(parts.mesh))
-    first, second = (jax.tree.map(lambda leaf, i=i: leaf[:, i], hulls) for i in (0, 1))
-    each = jax.vmap(jax.vmap(colliders.convex_prism, (None, 0)), (0, None))
-    plane = colliders.GeomInfo(jnp.zeros(3), jnp.eye(3), jnp.zeros(3))
-    table = jax.vmap(jax.vmap(colliders.plane_prism, (None, 0)), (None, 0))(plane, first)
-    return jax.vmap(each)(first, second)[0].min(-1), table[0].min(-1)
-
-
-def test_contact_depths_agree_with_mujoco_c() -> None:
-    scene, poses = _random_pairs(100)
-    with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):  # as in the engine
-        found, table = (np.asarray(x) for x in _depths(scene, poses))
-    touching = 0
-    for b in range(len(poses)):
-        one = jax.tree.map(lambda leaf, b=b: leaf[b], scene)
-        spec = mujoco.MjModel.from_xml_string(model.mjcf(one, config=mjx.DEFAULTS))
-        data = mujoco.MjData(spec)
-        data.qpos[:] = np.concatenate([[0, 0, 2, 0, 0, 0], poses[b].reshape(-1)])
-        mujoco.mj_forward(spec, data)
-        for i, j in np.argwhere(shapes.CORNERS_USED[one.shape[0]][:, None] * shapes.CORNERS_USED[one.shape[1]] > 0):
-            geoms = spec.geom(f"o0p{i}").id, spec.geom(f"o1p{j}").id
-            wanted = mujoco.mj_geomDistance(spec, data, *geoms, 0.1, None)
-            if -DEEPEST < wanted < -DEPTH_TOLERANCE:
-                assert abs(found[b, i, j] - wanted) < DEPTH_TOLERANCE, (b, i, j, found[b, i, j], wanted)
-                touching += 1
-            elif wanted > DEPTH_TOLERANCE:
-                assert found[b, i, j] == colliders.APART_DISTANCE
-        vertices = shapes.UNIT_VERTICES[one.shape[0]] * one.size[0]
-        turn = data.body("o0").xmat.reshape(3, 3)
-        used = shapes.CORNERS_USED[one.shape[0]] > 0
-        low = (vertices[used] @ turn.T)[..., 2].min(-1) + poses[b, 0, 2]
-        np.testing.assert_allclose(table[b][used], np.where(low < 0, low, colliders.APART_DISTANCE), atol=1e-6)
-        assert (table[b][~used] == colliders.APART_DISTANCE).all()
-    assert touching > 10
