@@ -127,9 +127,15 @@ def test_what_cannot_be_exported_is_one_line(
     out = ("--out", tmp_path / "e")
     refused("no manifest.json", tmp_path, *out)
     refused("grasp episodes are single frames", data["grasp"], *out, "--format", "lerobot")
-    refused("push episodes as hdf5 have none or all", data["push"], *out, "--format", "hdf5", "--images", "both")
+    both = "have none or all, a picture of every step; give one of these, or --format parquet or npz"
+    for form in ("hdf5", "lerobot"):
+        refused(
+            f"--images both: push episodes as {form} {both}\n", data["push"], *out, "--format", form, "--images", "both"
+        )
     refused("grasp episodes as parquet have none or before or after or both", data["grasp"], *out, "--images", "all")
-    refused("images episodes as npz have none or before", data["images"], *out, "--format", "npz", "--images", "after")
+    refused(
+        "as npz have none or before; give one of these\n", data["images"], *out, "--format", "npz", "--images", "after"
+    )
     refused("holds a data set", data["push"], "--out", data["push"])
     monkeypatch.setitem(export.NEEDS, "hdf5", ("h5py", "no_such_package"))
     refused("needs no_such_package; run pip install", data["push"], *out, "--format", "hdf5")
