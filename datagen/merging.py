@@ -1,50 +1,44 @@
-"""Data sets joined to one: their shards, byte for byte, in one folder."""
+"""Data sets joined to one: their shards, byte for byte, in one place."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import pathlib
-import shutil
+import urllib.parse
 from collections.abc import Sequence
 from typing import Any
 
 from dipn_jax.commands import console
 from dipn_jax.errors import UserError
-from dipn_jax.storage import accounting, manifest, owner, records, shards
-from dipn_jax.system import files, typed
+from dipn_jax.storage import accounting, manifest, mirror, records, shards
+from dipn_jax.storage.objects import Bucket
+from dipn_jax.system import addresses, files, typed
+
+from . import joined
+from .joined import Entry, Plan
 
 MAX_MESSAGE_CHARS = 400
 """Characters of what differs between two data sets that are shown at most."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """A shard that is to be joined with others."""
+def merge(places: Sequence[pathlib.Path], out: pathlib.Path) -> None:
+    """Join data sets.
 
-    path: pathlib.Path
-    sha256: str
-    meta: dict[str, Any]
-
-    @property
-    def scenes(self) -> str:
-        """What its scenes were drawn from; empty where that is not recorded."""
-        config = self.meta["config"]
-        if "seed" not in config:
-            return ""
-        return json.dumps([self.meta["kind"], config["seed"], config.get("scene"), self.meta["shard"]], sort_keys=True)
-
-
-def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> None:
-    """Join data sets in the folder `out`.
+    Args:
+      places: their folders or URLs.
+      out: folder of the joined data set, or its URL.
 
     Raises:
       UserError: one is missing or damaged, they are of several kinds or numbers of slots or have too many shards,
-        episodes were made twice, or the folder holds something else.
+        episodes were made twice, or `out` holds something else or cannot be written to.
     """
-    if out in folders or len(set(folders)) < len(folders):
-        raise UserError(f"merge: {out if out in folders else folders[0]} is named twice; want each folder once")
-    sets = {folder: _entries(folder) for folder in folders}
+    _require_apart(places, out)
+    url = addresses.url(out)
+    if url is None:
+        console.require_out(out)
+    elif not url.startswith("file:"):  # of which a folder would be made
+        Bucket(url)  # that it cannot be used is said before anything is copied from elsewhere
+    sets = {folder: _entries(folder) for folder in map(mirror.local, places)}
     entries = [entry for some in sets.values() for entry in some]
     if len(entries) > shards.MOST_SHARDS:
         raise UserError(
@@ -55,17 +49,19 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> None:
     widths = {entry.path: entry.meta["columns"]["scene.shape"]["shape"][0] for entry in entries}
     _require_one(widths, "number of object slots", "; training takes several folders: --data A B")
     _refuse_twice(entries)
-    identity, first, names = _plan(sets)
-    with owner.owned(out):
-        config = out / "config.json"
-        others = {path.name for path in shards.shard_files(out)} - set(names)
-        if others or (config.exists() and files.read_json(config) != identity):
-            raise UserError(f"--out {out}: holds another data set; give another folder")
-        files.write_json(config, identity)
-        if first is not None and (first / accounting.REQUEST_FILE).exists():
-            files.write_json(out / accounting.REQUEST_FILE, files.read_json(first / accounting.REQUEST_FILE))
-        _copy(dict(zip(names, entries, strict=True)), out)
-    _say(sets, out)
+    plan = _plan(sets)
+    _say(sets, joined.into_folder(plan, out) if url is None else joined.into_bucket(plan, url), url or str(out))
+
+
+def _require_apart(places: Sequence[pathlib.Path], out: pathlib.Path) -> None:
+    """Raise a UserError if two places are the same."""
+    named: set[str] = set()
+    for place in (*places, out):
+        address = addresses.url(place) or str(place)
+        folder = urllib.parse.unquote(address.removeprefix("file://")) if address.startswith("file:") else address
+        if folder in named:
+            raise UserError(f"merge: {address} is named twice; want each folder once")
+        named.add(folder)
 
 
 def _entries(folder: pathlib.Path) -> list[Entry]:
@@ -100,23 +96,23 @@ def _refuse_twice(entries: Sequence[Entry]) -> None:
             seen[key] = entry
 
 
-def _plan(sets: dict[pathlib.Path, list[Entry]]) -> tuple[dict[str, Any], pathlib.Path | None, list[str]]:
-    """Return the configuration of the result, the data set whose command makes it, and the names of its shards.
+def _plan(sets: dict[pathlib.Path, list[Entry]]) -> Plan:
+    """Return what the joined data set is.
 
     Data sets of one configuration, that are no merged ones, are parts of one data set: each shard keeps its number.
     """
-    configs = {json.dumps(entry.meta["config"], sort_keys=True) for some in sets.values() for entry in some}
+    entries = [entry for some in sets.values() for entry in some]
+    configs = {json.dumps(entry.meta["config"], sort_keys=True) for entry in entries}
     asked = {folder: accounting.asked(folder) for folder in sets}
     if len(configs) == 1 and all(asked.values()):
         first = max(sets, key=lambda folder: _episodes(asked[folder]))
-        names = [entry.path.name for some in sets.values() for entry in some]
-        if len(set(names)) == len(names):
-            return files.read_json(first / "config.json"), first, names
+        named = {entry.path.name: entry for entry in entries}
+        if len(named) == len(entries):
+            path = first / accounting.REQUEST_FILE
+            return Plan(files.read_json(first / "config.json"), files.read_json(path) if path.exists() else None, named)
     parts = [{"config": some[0].meta["config"], "episodes": _count(some)} for some in sets.values()]
-    number = sum(map(len, sets.values()))
-    names = [shards.shard_path(pathlib.Path(), index).name for index in range(number)]
-    shas = [entry.sha256 for some in sets.values() for entry in some]
-    return {"merged": parts, "shards": shas}, None, names
+    named = {shards.shard_path(pathlib.Path(), index).name: entry for index, entry in enumerate(entries)}
+    return Plan({"merged": parts, "shards": [entry.sha256 for entry in entries]}, None, named)
 
 
 def _episodes(asked: accounting.Asked | None) -> int:
@@ -127,20 +123,7 @@ def _count(entries: Sequence[Entry]) -> int:
     return sum(int(entry.meta["episodes"]) for entry in entries)
 
 
-def _copy(entries: dict[str, Entry], out: pathlib.Path) -> None:
-    """Copy the shards that are not there yet, and list all."""
-    there = [
-        name for name in entries if (out / name).is_file() and files.file_sha256(out / name) == entries[name].sha256
-    ]
-    with console.Progress("merge", len(entries), unit="shards", done=len(there)) as progress:
-        for name in entries.keys() - set(there):
-            with files.replacing(out / name) as path:
-                shutil.copyfile(entries[name].path, path)
-            progress.advance(1)
-    manifest.update_manifest(out)
-
-
-def _say(sets: dict[pathlib.Path, list[Entry]], out: pathlib.Path) -> None:
+def _say(sets: dict[pathlib.Path, list[Entry]], missing: str | None, out: str) -> None:
     """Say what has been joined, what differs, and what is missing."""
     first, *others = sets
     for folder in others:
@@ -148,13 +131,13 @@ def _say(sets: dict[pathlib.Path, list[Entry]], out: pathlib.Path) -> None:
         if apart:
             said = "; ".join(f"{key} {mine} and {its}" for key, (mine, its) in apart.items())
             console.say(f"{first} and {folder} differ: {typed.one_line(said, most=MAX_MESSAGE_CHARS)}")
-    about = records.summary(out)
-    if about["missing"]:
-        console.warn(about["missing"])
-    if mixed := accounting.mixed(about["made_by"]):
+    if missing:
+        console.warn(missing)
+    entries = [entry for some in sets.values() for entry in some]
+    if mixed := accounting.mixed(accounting.makers([entry.meta for entry in entries])):
         console.warn(f"{out}: {mixed}")
     held = ", ".join(f"{_count(some)} from {folder}" for folder, some in sets.items())
-    console.say(f"{out}: {about['episodes']} {about['kind']} episodes in {about['shards']} shards: {held}")
+    console.say(f"{out}: {_count(entries)} {entries[0].meta['kind']} episodes in {len(entries)} shards: {held}")
 
 
 def _differences(one: Any, other: Any, at: str = "") -> dict[str, tuple[Any, Any]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import dataclasses
 import functools
-import hashlib
 import os
 import pathlib
 import re
@@ -14,14 +13,10 @@ import subprocess
 import sys
 from typing import Any
 
-import jax
-import numpy as np
-import orbax.checkpoint as ocp
-
-from dipn_jax import structs
 from dipn_jax.errors import UserError
-from dipn_jax.storage import checkpoint, records
 from dipn_jax.system import files
+from experiments import faults_found
+from experiments.faults_found import Result
 from experiments.runs import PROGRAMS
 
 FILTER = "--seccomp-bpf"
@@ -35,8 +30,9 @@ class Case:
     """A small command whose faults are tried."""
 
     name: str
-    words: tuple[str, ...]  # `{data}` stands for the folder of data sets
-    needs: tuple[tuple[str, ...], ...] = ()  # commands that make those
+    words: tuple[str, ...]  # `{data}` stands for the folder of what it reads
+    needs: tuple[tuple[str, tuple[str, ...]], ...] = ()  # what it reads: names in that folder, and commands
+    points: int = 40  # faults that are tried
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,84 +98,6 @@ def count_calls(
     return found
 
 
-@dataclasses.dataclass(frozen=True)
-class Result:
-    """What a command has made: its records, in order, and a digest of every result that must not differ."""
-
-    records: list[str]
-    digests: dict[str, str]
-
-
-def result(out: pathlib.Path) -> Result:
-    """Return what a finished command has made in a folder: a data set, a run or an evaluation.
-
-    Raises:
-      UserError: something in it is damaged.
-    """
-    if (out / "manifest.json").exists():
-        episodes, _ = records.load(out, kind="push")
-        rows = [structs.take(episodes, i) for i in range(len(episodes.fault))]
-        names = ("config.json", "manifest.json", *(path.name for path in out.glob("shard-*")))
-        return Result([_digest(row) for row in rows], {name: files.file_sha256(out / name) for name in names})
-    if (out / "checkpoints").exists():
-        found = checkpoint.newest(out)
-        if found is None:
-            raise UserError(f"{out}: no whole step")
-        folder, meta = found
-        arrays = {name: _digest(arrays_of(folder / name)) for name in ("model", "train") if (folder / name).exists()}
-        lines = files.read_text(out / "metrics.jsonl").splitlines()
-        plain = {key: value for key, value in meta.items() if key != "sha256"}
-        return Result(lines, arrays | {"meta": repr(sorted(plain.items())), "metrics": "\n".join(lines)})
-    entries = files.read_json(out / "episodes.json", wanted=list)
-    names = ("metrics.json", "settings.json", "episodes.json", *(entry["file"] for entry in entries))
-    return Result([repr(entry) for entry in entries], {name: files.file_sha256(out / name) for name in names})
-
-
-def arrays_of(part: pathlib.Path) -> dict[str, np.ndarray]:
-    """Return the arrays of one part of a step, `STEP/model` or `STEP/train`, by their names in the order of these."""
-    checkpointer = ocp.PyTreeCheckpointer()
-    names = sorted(checkpointer.metadata(part.resolve()).item_metadata.tree)
-    as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in names}
-    found = checkpointer.restore(part.resolve(), restore_args=as_numpy)
-    return {name: found[name] for name in names}
-
-
-def _digest(tree: Any) -> str:
-    found = hashlib.sha256()
-    for leaf in jax.tree.leaves(tree):
-        found.update(np.ascontiguousarray(leaf).tobytes())
-    return found.hexdigest()
-
-
-def damaged(out: pathlib.Path, whole: Result) -> list[str]:
-    """Return what has its final name after a fault, and is not as an undisturbed run makes it or cannot be read."""
-    wrong = []
-    for name in whole.digests:
-        path = out / name
-        written_once = name.endswith((".parquet", ".npz")) or name == "metrics.json"
-        if written_once and path.exists() and files.file_sha256(path) != whole.digests[name]:
-            wrong.append(name)
-    for path in [*out.glob("*.json")]:
-        if not path.name.startswith("owner"):
-            try:
-                files.read_json(path, wanted=object)
-            except UserError:
-                wrong.append(path.name)
-    steps = out / "checkpoints"
-    for folder in steps.iterdir() if steps.is_dir() else []:
-        if folder.name.isdigit() and checkpoint.newest(folder) is None:
-            wrong.append(f"checkpoints/{folder.name}")
-    return wrong
-
-
-def compare(found: Result, whole: Result) -> dict[str, int]:
-    """Return how many records are lost and repeated, and whether anything differs from an undisturbed run's."""
-    here, there = collections.Counter(found.records), collections.Counter(whole.records)
-    repeated = sum(max(0, here[record] - there[record]) for record in here if record in there)
-    wrong = found.digests != whole.digests
-    return {"lost": (there - here).total(), "repeated": repeated, "wrong": int(wrong)}
-
-
 def attempt(point: Point, case: Case, kind: Kind, whole: Result, *, out: pathlib.Path) -> dict[str, Any]:
     """Try one fault and compare what comes of it with `whole`.
 
@@ -192,7 +110,7 @@ def attempt(point: Point, case: Case, kind: Kind, whole: Result, *, out: pathlib
 
     Returns:
       `reached` (1 if the fault happened), `lost`, `repeated`, `wrong`, `damaged` (between the fault and the second
-      run), `tracebacks`, and `codes`, the exit codes of both runs.
+      run; also of what the command reads), `tracebacks`, and `codes`, the exit codes of both runs.
     """
     work, log = out / "work" / case.name, out / "trace"
     shutil.rmtree(work, ignore_errors=True)
@@ -200,16 +118,18 @@ def attempt(point: Point, case: Case, kind: Kind, whole: Result, *, out: pathlib
     injected = f"inject={kind.calls}:{kind.fault}:when={point.when}"
     quick = () if "signal" in kind.fault else (FILTER,)
     traced = (*quick, "-o", str(log), "-e", f"trace={kind.calls}", "-e", injected)
+    sources = read_by(case, out)
     try:
         code, said = run(words, cache=out / "cache", trace=traced)
         reached = code < 0 or code == 137 or "(INJECTED)" in files.read_text(log)
-        torn = damaged(work, whole) if work.exists() else []
+        torn = faults_found.damaged(work, whole) if work.exists() else []
+        torn += sorted({name for name, _ in sources.items() ^ read_by(case, out).items()})
         again, then = run(words, cache=out / "cache")
     except subprocess.TimeoutExpired:
         return {"reached": 1, "lost": 0, "repeated": 0, "wrong": 1, "damaged": 0, "tracebacks": 0, "codes": ["hung"]}
     said += then
     try:
-        outcome = compare(result(work), whole)
+        outcome = faults_found.compare(faults_found.result(work), whole)
     except (UserError, OSError) as error:
         outcome = {"lost": len(whole.records), "repeated": 0, "wrong": 1}
         said += str(error)
@@ -221,7 +141,7 @@ def attempt(point: Point, case: Case, kind: Kind, whole: Result, *, out: pathlib
         "tracebacks": said.count("Traceback (most recent call last)"),
         "codes": [code, again],
     }
-    found["wrong"] = int(bool(found["wrong"]) or bad_code)
+    found["wrong"] = int(bool(found["wrong"]) or bad_code or read_by(case, out) != sources)
     troubled = any(found[name] for name in ("lost", "repeated", "wrong", "damaged", "tracebacks"))
     return found | ({"said": said[-3000:], "torn": torn} if troubled else {})
 
@@ -238,16 +158,22 @@ def reference(case: Case, out: pathlib.Path) -> Result:
     Raises:
       UserError: one of the commands fails.
     """
-    for words in case.needs:
-        if not (out / "data" / words[1] / "manifest.json").exists():
-            _run_well((*words, "--out", str(out / "data" / words[1])), out)
+    for name, words in case.needs:
+        if not any((out / "data" / name / last).exists() for last in ("manifest.json", "part.json")):
+            _run_well((*words, "--out", str(out / "data" / name)), out)
     whole, work = out / "whole" / case.name, out / "work" / case.name
     if not whole.exists():
         shutil.rmtree(work, ignore_errors=True)
         _run_well(command(case, work, out), out)
         whole.parent.mkdir(exist_ok=True)
         work.rename(whole)  # an evaluation says in its settings where it was written
-    return result(whole)
+    return faults_found.result(whole)
+
+
+def read_by(case: Case, out: pathlib.Path) -> dict[str, str]:
+    """Return the SHA-256 of every file that a command reads, by name: none of them may change."""
+    folders = {name: out / "data" / name for name, _ in case.needs}
+    return {f"{name}/{file}": sha for name, at in folders.items() for file, sha in faults_found.tree(at).items()}
 
 
 def _run_well(words: tuple[str, ...], out: pathlib.Path) -> None:

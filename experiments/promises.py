@@ -178,9 +178,12 @@ PROMISES = (
         ),
     ),
     Promise(
-        "Data sets are merged completely or not at all, and an interrupted export continues to the same bytes.",
+        "Data sets are merged completely or not at all, and an interrupted merge or export continues to the same "
+        "bytes; so does a merge into object storage, which replaces no shard that is there.",
         (
             "tests/datagen/test_merging.py::test_an_interrupted_merge_continues",
+            "tests/datagen/test_joined.py::test_a_merge_that_is_killed_goes_on_and_racing_ones_create_each_shard_once",
+            "tests/datagen/test_joined.py::test_what_is_there_of_somebody_else_stays_and_is_one_line",
             "tests/datagen/exporting/test_export.py::test_an_interrupted_export_ends_as_an_undisturbed_one",
         ),
     ),

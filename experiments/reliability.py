@@ -14,7 +14,7 @@ import shutil
 import sys
 import tempfile
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from dipn_jax.commands import console, markdown
@@ -51,10 +51,19 @@ def box(values: dict[str, Any]) -> str:
     lines = [f"{', '.join(parsers)}: {about}" for about, parsers in fuzzed.items()]
     if len(lines) == 1:
         lines = [f"inputs: {about}" for about in fuzzed]
-    for name, made in (("faults", values.get("faults", {}).get(pages.MADE)), ("damaged", values.get("checkpoints"))):
-        lines += [f"{name}: commit {made['commit']}, {made['processor']}"] if made else []
+    disturbed: dict[str, list[str]] = {}
+    for case, made in values.get("faults", {}).get(pages.MADE, {}).items():
+        disturbed.setdefault(_made(made), []).append(case)
+    lines += [
+        f"faults: {about}" if len(disturbed) == 1 else f"{', '.join(disturbed[about])}: {about}" for about in disturbed
+    ]
+    lines += [f"damaged: {_made(values['checkpoints'])}"] if "checkpoints" in values else []
     wrapped = [textwrap.fill(line, pages.BOX_WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in lines]
     return "\n".join(["```", *wrapped, "```"]) + "\n"
+
+
+def _made(made: dict[str, Any]) -> str:
+    return f"commit {made['commit']}, {made['processor']}"
 
 
 def write(key: str, found: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -> None:
@@ -64,6 +73,24 @@ def write(key: str, found: dict[str, Any], *, docs: pathlib.Path = pages.DOCS) -
     text = pages.with_box(pages.with_tables(files.read_text(page), section(values)), box(values))
     files.write_json(path, values)
     files.write_text(page, text)
+
+
+def write_faults(
+    found: dict[str, Any], made: dict[str, str], *, known: Collection[str], docs: pathlib.Path = pages.DOCS
+) -> None:
+    """Put counts of faults, by command and kind, beside those of other commands.
+
+    Args:
+      found: the counts.
+      made: at which commit and on what processor they were made.
+      known: names of all commands; what is said of others is left out.
+      docs: folder of the page and of its JSON.
+    """
+    path = docs / f"{PAGE}.json"
+    there = files.read_json(path).get("faults", {}) if path.exists() else {}
+    by_name = {name: row for name, row in there.items() if name in known} | found
+    by_commit = {name: one for name, one in there.get(pages.MADE, {}).items() if name in known}
+    write("faults", by_name | {pages.MADE: by_commit | dict.fromkeys(found, made)}, docs=docs)
 
 
 def _flip(path: pathlib.Path) -> None:

@@ -40,7 +40,7 @@ _LAYOUTS = {
     "lerobot": (
         "LeRobot's format, version 3. A frame is a step: `observation.state` is the gripper, "
         "`observation.environment_state` the poses `[N, 7]` in row-major order, `observation.size` the sizes `[N, 3]` "
-        "of the objects. Pictures are PNG; in `observation.images.height` grey is millimetres, in "
+        "of the objects. There is no video: pictures are PNG; in `observation.images.height` grey is millimetres, in "
         "`observation.images.label` the slot plus one. Classes, masses, frictions, faults and the poses after the push "
         "are left out; the other formats have them."
     ),

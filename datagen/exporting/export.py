@@ -79,13 +79,14 @@ def _suits(kind: str, form: str, images: str) -> None:
     """Check that a format can hold episodes of a kind, with the pictures that are asked for."""
     if form == "lerobot" and kind != "push":
         raise UserError(f"--format lerobot: holds trajectories, and {kind} episodes are single frames; give parquet")
-    if form in ("parquet", "npz"):
-        of_kind = {"push": ("none", "before", "after", "both", "all"), "grasp": ("none", "before", "after", "both")}
-        allowed = of_kind.get(kind, ("none", "before"))
-    else:
+    of_kind = {"push": ("none", "before", "after", "both", "all"), "grasp": ("none", "before", "after", "both")}
+    allowed = in_tables = of_kind.get(kind, ("none", "before"))
+    if form not in ("parquet", "npz"):
         allowed = steps.images_of(kind)
     if images not in allowed:
-        raise UserError(f"--images {images}: {kind} episodes as {form} have {' or '.join(allowed)}")
+        given = " or ".join(allowed) + (", a picture of every step" if allowed != in_tables else "")
+        tables = ", or --format parquet or npz" if images in in_tables else ""
+        raise UserError(f"--images {images}: {kind} episodes as {form} have {given}; give one of these{tables}")
 
 
 def _writer(source: Source, out: pathlib.Path, form: str, images: str) -> Writer:

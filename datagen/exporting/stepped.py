@@ -152,6 +152,6 @@ class Zarr:
         array[begin:] = values
 
     def finish(self, parts: Sequence[Part]) -> None:
-        """Delete what processes that were killed have left of chunks that were being replaced."""
-        for path in self.out.glob("*.zarr/*/*/*.partial"):
+        """Delete what processes that were killed have left of files that were being replaced."""
+        for path in self.out.glob("*.zarr/**/*.partial"):
             path.unlink(missing_ok=True)

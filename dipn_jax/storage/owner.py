@@ -40,7 +40,8 @@ def owned(out: pathlib.Path) -> Iterator[None]:
         started = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
         about = {"host": socket.gethostname(), "pid": os.getpid(), "started": started}
         os.write(descriptor, (json.dumps(about) + "\n").encode())
-        for folder in (out, out / "checkpoints"):
+        each = [place for films in out.glob("*/episodes") for place in (films.parent, films)]  # as a sweep has them
+        for folder in (out, out / "checkpoints", out / "episodes", *each):
             temporary.delete_leftovers(folder)
         yield
     finally:

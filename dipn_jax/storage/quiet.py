@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import sys
 from collections.abc import Iterator
 from typing import Any
 
 
 def _printed(record: logging.LogRecord) -> bool:
-    """Return whether a report of asyncio is printed: all are, except those of failed tasks that nobody waited for."""
-    return not record.getMessage().startswith("Task exception was never retrieved")
+    """Return whether a report of asyncio is printed: all are, except those of failed writes that nobody waited for."""
+    return not re.match(r"\w+ exception was never retrieved", record.getMessage())  # of a Task, a Future or several
 
 
 @contextlib.contextmanager

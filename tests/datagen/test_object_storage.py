@@ -169,7 +169,6 @@ def test_what_cannot_be_there_is_refused_in_one_line(
     gone = f"file://{tmp_path}/gone"
     for words, said in (
         (["merge", gone], f"merge {gone}: shards need not be listed there; dipn-datagen verify {gone} checks them"),
-        (["merge", "a", "b", "--out", "s3://b/x"], "s3://b/x: a URL, which this option does not take; give a path"),
         (["export", "data", "--out", "gs://b/x"], "gs://b/x: a URL, which this option does not take; give a path"),
         (["info", gone], f"data set {gone}: no such folder; give one that dipn-datagen wrote"),
     ):

@@ -13,7 +13,7 @@ from experiments import pages, promises, reliability
 ROOT = pathlib.Path(__file__).parent.parent.parent
 VALUES = {
     "faults": {
-        "made": {"commit": "abc", "processor": "Some"},
+        "made": {key: {"commit": "abc", "processor": "Some"} for key in ("push", "clear")},
         "push": {"killed": {"tried": 3, "lost": 1, "repeated": 0, "wrong": 1, "damaged": 0, "tracebacks": 0}},
         "clear": {"killed": {"tried": 4, "lost": 0, "repeated": 2, "wrong": 0, "damaged": 0, "tracebacks": 0}},
     },
@@ -47,6 +47,9 @@ def test_the_box_says_of_every_count_how_it_was_made() -> None:
     lines = reliability.box(VALUES).splitlines()[1:-1]
     assert lines[:2] == ["shard: commit def, seed 0", "meta: commit abc, seed 0"]
     assert lines[2:] == ["faults: commit abc, Some", "damaged: commit ghi, Other"]
+    made = VALUES["faults"]["made"] | {"clear": {"commit": "abd", "processor": "Some"}}
+    lines = reliability.box({"faults": {"made": made}}).splitlines()[1:-1]
+    assert lines == ["push: commit abc, Some", "clear: commit abd, Some"]
     alike = {name: found | {"commit": "abc"} for name, found in VALUES["fuzz"].items()}
     assert reliability.box({"fuzz": alike}).splitlines()[1:-1] == ["inputs: commit abc, seed 0"]
 
@@ -77,6 +80,23 @@ def test_what_an_experiment_found_is_put_beside_what_others_found(tmp_path: path
         reliability.write(key, VALUES[key], docs=tmp_path)
     assert files.read_json(tmp_path / "reliability.json") == VALUES
     assert reliability.section(VALUES) in (tmp_path / "reliability.md").read_text()
+
+
+def test_faults_of_a_command_are_put_beside_those_of_others(tmp_path: pathlib.Path) -> None:
+    shutil.copy(ROOT / "docs" / "reliability.md", tmp_path)
+    for key in VALUES:
+        reliability.write(key, VALUES[key], docs=tmp_path)
+    rows, made = {"killed": VALUES["faults"]["push"]["killed"] | {"tried": 9}}, {"commit": "new", "processor": "Some"}
+    reliability.write_faults({"push": rows, "merge": rows}, made, known=["push", "merge"], docs=tmp_path)
+    found = files.read_json(tmp_path / "reliability.json")["faults"]
+    assert found == {"push": rows, "merge": rows, "made": {"push": made, "merge": made}}, (
+        "clear is none of ours any more"
+    )
+    reliability.write_faults({"clear": rows}, made | {"commit": "newer"}, known=["push", "clear"], docs=tmp_path)
+    found = files.read_json(tmp_path / "reliability.json")["faults"]
+    assert found["push"] == found["clear"] == rows and found["made"]["push"] == made
+    text = (tmp_path / "reliability.md").read_text()
+    assert "\npush: commit new, Some\nclear: commit newer, Some\n" in text
 
 
 def test_every_kind_of_damage_is_noticed(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:

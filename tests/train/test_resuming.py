@@ -21,7 +21,7 @@ from dipn_jax.errors import UserError
 from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.storage import checkpoint
-from experiments.faults_run import arrays_of
+from experiments.faults_found import arrays_of
 
 BRIEF = TrainConfig(steps=6, batch=4, eval_every=3, save_every=3)
 NAMES = ("push", "grasp-pretrain", "grasp")

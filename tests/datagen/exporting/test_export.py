@@ -87,6 +87,8 @@ def test_an_interrupted_export_ends_as_an_undisturbed_one(
     assert run(data["push"], "--out", tmp_path / "twice", "--format", form) == 130
     assert not (tmp_path / "twice" / "README.md").exists(), "the card comes last"
     assert not list((tmp_path / "twice").rglob("*.tmp")) and not (tmp_path / "twice" / "owner.json").exists()
+    for place in ("", "meta", "data/poses") if form == "zarr" else ():  # where a process may have been killed
+        (tmp_path / "twice" / "train.zarr" / place / ".zattrs.0a1b.partial").touch()
     assert run(data["push"], "--out", tmp_path / "twice", "--format", form) == 0
     assert calls.count("train-00000") == 1, "what is written is not read again"
     assert len(calls) == 4
@@ -128,9 +130,15 @@ def test_what_cannot_be_exported_is_one_line(
     out = ("--out", tmp_path / "e")
     refused("no manifest.json", tmp_path, *out)
     refused("grasp episodes are single frames", data["grasp"], *out, "--format", "lerobot")
-    refused("push episodes as hdf5 have none or all", data["push"], *out, "--format", "hdf5", "--images", "both")
+    both = "have none or all, a picture of every step; give one of these, or --format parquet or npz"
+    for form in ("hdf5", "lerobot"):
+        refused(
+            f"--images both: push episodes as {form} {both}\n", data["push"], *out, "--format", form, "--images", "both"
+        )
     refused("grasp episodes as parquet have none or before or after or both", data["grasp"], *out, "--images", "all")
-    refused("images episodes as npz have none or before", data["images"], *out, "--format", "npz", "--images", "after")
+    refused(
+        "as npz have none or before; give one of these\n", data["images"], *out, "--format", "npz", "--images", "after"
+    )
     refused("holds a data set", data["push"], "--out", data["push"])
     monkeypatch.setitem(export.NEEDS, "hdf5", ("h5py", "no_such_package"))
     refused("needs no_such_package; run pip install", data["push"], *out, "--format", "hdf5")

@@ -209,10 +209,11 @@ def _decoded(pictures: list[dict[str, bytes]]) -> np.ndarray:
     )
 
 
-def test_lerobot_doctor_finds_nothing(data: Data, tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize("images", ["none", "all"])
+def test_lerobot_doctor_finds_nothing(images: str, data: Data, tmp_path: pathlib.Path) -> None:
     doctor = shutil.which("lerobot-doctor", path=str(pathlib.Path(sys.executable).parent))
     if doctor is None:
         pytest.skip("no lerobot-doctor here")
-    out = exported(data, "push", tmp_path / "l", "lerobot")
+    out = exported(data, "push", tmp_path / "l", "lerobot", images=images)
     done = subprocess.run([doctor, "check", str(out)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

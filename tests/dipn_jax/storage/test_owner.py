@@ -85,10 +85,14 @@ def test_what_dead_processes_left_is_swept_at_the_next_start(tmp_path: pathlib.P
     for process in (f"{host}-{ended.pid}-0a1b2c3d", living, "elsewher-1-0a1b2c3d"):
         (steps / f".00000003.{process}.tmp" / "model").mkdir(parents=True)
         (tmp_path / f".partial.npz.{process}.tmp").touch()
+    for films in (tmp_path / "episodes", tmp_path / "0.05" / "episodes"):
+        films.mkdir(parents=True)
+        for folder in {films, films.parent}:
+            (folder / f".000.npz.{host}-{ended.pid}-0a1b2c3d.tmp").touch()
     (tmp_path / ".mine.tmp").touch()
 
     def left() -> set[str]:
-        return {p.name for p in (*tmp_path.iterdir(), *steps.iterdir()) if p != steps}
+        return {p.name for p in tmp_path.rglob("*.tmp")}
 
     temporary.delete_leftovers(tmp_path, shared=True)
     assert {name for name in left() if name.startswith(".partial")} == {

@@ -151,8 +151,9 @@ def test_writes_that_nobody_waits_for_are_not_reported_after_a_save_that_failed(
 
     async def forget() -> None:
         task = asyncio.ensure_future(fails())
+        several = asyncio.gather(fails())
         await asyncio.sleep(0.01)
-        del task
+        del task, several
         gc.collect()
 
     gc.collect()  # what tests before this one have forgotten
