@@ -172,7 +172,7 @@ def _page(folder: pathlib.Path, about: dict[str, Any], counts: Counts, figures: 
 
 
 def _remarks(about: dict[str, Any]) -> Iterator[str]:
-    for said in (about["missing"], accounting.mixed(about["made_by"])):
+    for said in (about["missing"], accounting.describe_mixed_makers(about["made_by"])):
         if said:
             yield said
 

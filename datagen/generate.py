@@ -86,7 +86,7 @@ class Job:
 
     def shards(self) -> int:
         """Return how many shards the data set has."""
-        return accounting.Asked(self.episodes, self.shard_size).shards()
+        return accounting.RequestedSize(self.episodes, self.shard_size).shards()
 
     def describe(self) -> dict[str, Any]:
         """Return the job as it is written beside the shards; with the kind of device if batches depend on it."""
@@ -96,7 +96,7 @@ class Job:
 
     def size(self, index: int) -> int:
         """Return the number of episodes of shard `index`."""
-        return accounting.Asked(self.episodes, self.shard_size).size(index)
+        return accounting.RequestedSize(self.episodes, self.shard_size).size(index)
 
 
 Elsewhere = Callable[[Job, Sequence[int], pathlib.Path], Generator[tuple[str, dict[str, Any]], None, None]]
@@ -181,7 +181,7 @@ def generate(
       of: number of workers.
       threads: that `native` simulates on; shards are then made one at a time, so that no more are used.
       scorer: the network of `job.weights`, for guided and unsure grasps.
-      command: what makes the data set, as `accounting.note` keeps it.
+      command: what makes the data set, as `accounting.save_command` keeps it.
       elsewhere: makes the shards on other machines; all are made here if not given.
 
     Raises:

@@ -46,7 +46,7 @@ class Plan:
     """A joined data set."""
 
     config: dict[str, Any]
-    request: dict[str, Any] | None  # the command that makes it, as `accounting.note` keeps it
+    request: dict[str, Any] | None  # the command that makes it, as `accounting.save_command` keeps it
     entries: dict[str, Entry]  # its shards by their names in it
 
     def describe(self, folder: pathlib.Path) -> None:
@@ -58,7 +58,7 @@ class Plan:
     def missing(self, folder: pathlib.Path) -> str | None:
         """Say what is missing of it, as `accounting.missing`; `describe` has written to the folder."""
         held = {name: {"episodes": entry.meta["episodes"]} for name, entry in self.entries.items()}
-        return accounting.missing(folder, accounting.held(held))
+        return accounting.missing(folder, accounting.episodes_by_shard(held))
 
     def holds_another(self, folder: pathlib.Path, names: Collection[str]) -> bool:
         """Return whether a place holds something else than a part of this data set.

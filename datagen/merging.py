@@ -103,7 +103,7 @@ def _plan(sets: dict[pathlib.Path, list[Entry]]) -> Plan:
     """
     entries = [entry for some in sets.values() for entry in some]
     configs = {json.dumps(entry.meta["config"], sort_keys=True) for entry in entries}
-    asked = {folder: accounting.asked(folder) for folder in sets}
+    asked = {folder: accounting.requested_size(folder) for folder in sets}
     if len(configs) == 1 and all(asked.values()):
         first = max(sets, key=lambda folder: _episodes(asked[folder]))
         named = {entry.path.name: entry for entry in entries}
@@ -115,7 +115,7 @@ def _plan(sets: dict[pathlib.Path, list[Entry]]) -> Plan:
     return Plan({"merged": parts, "shards": [entry.sha256 for entry in entries]}, None, named)
 
 
-def _episodes(asked: accounting.Asked | None) -> int:
+def _episodes(asked: accounting.RequestedSize | None) -> int:
     return asked.episodes if asked else 0
 
 
@@ -134,7 +134,7 @@ def _say(sets: dict[pathlib.Path, list[Entry]], missing: str | None, out: str) -
     if missing:
         console.warn(missing)
     entries = [entry for some in sets.values() for entry in some]
-    if mixed := accounting.mixed(accounting.makers([entry.meta for entry in entries])):
+    if mixed := accounting.describe_mixed_makers(accounting.makers([entry.meta for entry in entries])):
         console.warn(f"{out}: {mixed}")
     held = ", ".join(f"{_count(some)} from {folder}" for folder, some in sets.items())
     console.say(f"{out}: {_count(entries)} {entries[0].meta['kind']} episodes in {len(entries)} shards: {held}")

@@ -90,7 +90,7 @@ def info(
 
         browsing.write(folder, html, sample=sample, seed=seed)
     console.say(json.dumps(summary, indent=1))
-    mixed = accounting.mixed(summary["made_by"])
+    mixed = accounting.describe_mixed_makers(summary["made_by"])
     for said in (mixed and f"{folder}: {mixed}", summary["missing"]):
         if said:
             console.warn(said)

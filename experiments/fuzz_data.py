@@ -46,5 +46,5 @@ def data_set(folder: pathlib.Path, *, kind: str = "push", number: int = 2) -> No
     for index in range(number):
         shards.write_shard(folder, index, episodes(kind), kind=kind, config=config, faults={"dropped_scenes": 1})
     files.write_json(folder / "config.json", config)
-    accounting.note(folder, [kind, "--episodes", "6"], of=3)
+    accounting.save_command(folder, [kind, "--episodes", "6"], of=3)
     update_manifest(folder)

@@ -26,7 +26,7 @@ NOT_RECORDED = "not recorded"
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
+class RequestedSize:
     """Requested size of a data set; the last shard may be shorter."""
 
     episodes: int
@@ -41,7 +41,7 @@ class Asked:
         return min(self.shard_size, self.episodes - index * self.shard_size)
 
 
-def note(folder: pathlib.Path, command: Sequence[str], *, of: int) -> None:
+def save_command(folder: pathlib.Path, command: Sequence[str], *, of: int) -> None:
     """Keep the command that makes a data set, without `--out`, `--shard` and `--of`, and the number of workers."""
     files.write_json(folder / REQUEST_FILE, {"command": list(command), "of": of})
 
@@ -58,7 +58,7 @@ def command(folder: pathlib.Path) -> list[str] | None:
     return ["dipn-datagen", *files.read_json(path, wanted={"command": [str]})["command"]]
 
 
-def asked(folder: pathlib.Path) -> Asked | None:
+def requested_size(folder: pathlib.Path) -> RequestedSize | None:
     """Return the requested size of a data set; None where its folder does not say it.
 
     Raises:
@@ -70,7 +70,7 @@ def asked(folder: pathlib.Path) -> Asked | None:
     if merged(folder) is not None:
         return None
     found = files.read_json(path, wanted={"episodes": typed.Whole(1), "shard_size": typed.Whole(1)})
-    return Asked(found["episodes"], found["shard_size"])
+    return RequestedSize(found["episodes"], found["shard_size"])
 
 
 def merged(folder: pathlib.Path) -> list[dict[str, Any]] | None:
@@ -89,7 +89,7 @@ def merged(folder: pathlib.Path) -> list[dict[str, Any]] | None:
     return found.get("merged")
 
 
-def held(entries: Mapping[str, Any]) -> dict[int, int]:
+def episodes_by_shard(entries: Mapping[str, Any]) -> dict[int, int]:
     """Return the number of episodes in each shard that a manifest lists, by the shard's number."""
     named = ((re.fullmatch(r"shard-(\d{1,18})\.parquet", name), entry) for name, entry in entries.items())
     numbers = [(int(name[1]) if name else -1 - at, entry["episodes"]) for at, (name, entry) in enumerate(named)]
@@ -109,7 +109,7 @@ def missing(folder: pathlib.Path, held: Mapping[int, int]) -> str | None:
     Raises:
       UserError: the configuration of the data set, or the command that is kept, is damaged.
     """
-    want = asked(folder)
+    want = requested_size(folder)
     if want is None:
         return None
     # a configuration can ask for more shards than can be listed: those that are there are fewer
@@ -161,7 +161,7 @@ def makers(metas: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def mixed(made_by: Sequence[Mapping[str, Any]]) -> str | None:
+def describe_mixed_makers(made_by: Sequence[Mapping[str, Any]]) -> str | None:
     """Say in one line what differs between those who made a data set; None where nothing does.
 
     Args:

@@ -39,7 +39,7 @@ class Place(Protocol):
         """Let `claim` write the configuration, or compare it with the one that is there."""
 
     def note(self, command: Sequence[str], *, of: int) -> None:
-        """Keep the command, as `accounting.note`."""
+        """Keep the command, as `accounting.save_command`."""
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
         """Return the number of episodes in each of these shards that is there."""
@@ -78,7 +78,7 @@ class Folder:
         temporary.delete_leftovers(self.folder, shared=True)
 
     def note(self, command: Sequence[str], *, of: int) -> None:
-        accounting.note(self.folder, command, of=of)
+        accounting.save_command(self.folder, command, of=of)
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:
         paths = {index: shards.shard_path(self.folder, index) for index in indices}
@@ -129,7 +129,7 @@ class Objects:
                 return
 
     def note(self, command: Sequence[str], *, of: int) -> None:
-        accounting.note(self.folder, command, of=of)
+        accounting.save_command(self.folder, command, of=of)
         self._bucket.put(accounting.REQUEST_FILE, files.read_bytes(self.folder / accounting.REQUEST_FILE))
 
     def counts(self, indices: Sequence[int]) -> dict[int, int]:

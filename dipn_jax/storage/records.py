@@ -79,7 +79,7 @@ def _looks(folder: pathlib.Path) -> list[tuple[pathlib.Path, Look]]:
 
 def _said(folder: pathlib.Path, looks: list[tuple[pathlib.Path, Look]]) -> tuple[Problems, str | None]:
     """Return what `examined` does."""
-    mixed = accounting.mixed(accounting.makers([meta for _, (_, meta) in looks if meta is not None]))
+    mixed = accounting.describe_mixed_makers(accounting.makers([meta for _, (_, meta) in looks if meta is not None]))
     return [(path, what) for path, (what, _) in looks if what], mixed and f"{folder}: {mixed}"
 
 
@@ -138,8 +138,8 @@ def summary(folder: pathlib.Path) -> dict[str, Any]:
     for entry in found.values():
         for name, count in entry["faults"].items():
             faults[name] = faults.get(name, 0) + count
-    held = accounting.held(found)
-    asked = accounting.asked(folder)
+    held = accounting.episodes_by_shard(found)
+    asked = accounting.requested_size(folder)
     return {
         "kind": next((entry["kind"] for entry in found.values()), None),
         "episodes": sum(held.values()),
@@ -163,7 +163,7 @@ def missing(folder: pathlib.Path) -> str | None:
     """
     listed = manifest.listed(folder)
     others = {path.name: {"episodes": shards.count(path)} for path in manifest.unlisted(folder, listed)}
-    return accounting.missing(folder, accounting.held(listed | others))
+    return accounting.missing(folder, accounting.episodes_by_shard(listed | others))
 
 
 def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | SettledScene:
@@ -259,7 +259,7 @@ def _checked(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], Metas]
     if mixed:
         console.warn(mixed)
     try:
-        said = accounting.missing(folder, accounting.held(found))
+        said = accounting.missing(folder, accounting.episodes_by_shard(found))
     except UserError as error:  # what was asked for cannot be read; the shards are whole all the same
         said = str(error)
     if said:

@@ -50,7 +50,7 @@ def write(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:
     from .. import metrics
 
     made_by = accounting.makers([{**vars(part), "versions": {}} for part in parts])
-    if said := accounting.mixed(made_by):
+    if said := accounting.describe_mixed_makers(made_by):
         console.warn(said.replace("its shards were", "parts were"))
     values = _merger(parts[0].kind)(sorted(parts, key=lambda part: part.shard), out)
     metrics.write(out, values, settings=parts[0].settings | {"out": str(out)})

@@ -41,7 +41,7 @@ def test_a_whole_data_set_misses_nothing(copy: pathlib.Path, capsys: pytest.Capt
 def test_a_worker_that_never_ran_is_named_with_its_command(
     copy: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    accounting.note(copy, COMMAND, of=2)
+    accounting.save_command(copy, COMMAND, of=2)
     _without(copy, 1)
     command = f"dipn-datagen push --episodes 24 --shard-size 16 --out {copy} --shard 1 --of 2"
     said = f"{copy}: 16 of 24 episodes, shard 1 missing: run `{command}`"
@@ -70,14 +70,14 @@ def test_what_is_missing_is_said_with_what_fills_it(
     tmp_path: pathlib.Path, held: dict[int, int], said: str | None
 ) -> None:
     files.write_json(tmp_path / "config.json", {"episodes": 8, "shard_size": 3})
-    accounting.note(tmp_path, ["push"], of=3)
+    accounting.save_command(tmp_path, ["push"], of=3)
     found = accounting.missing(tmp_path, held)
     assert found == (None if said is None else f"{tmp_path}: {said.format(tmp_path)}")
 
 
 def test_of_many_missing_shards_some_are_named(tmp_path: pathlib.Path) -> None:
     files.write_json(tmp_path / "config.json", {"episodes": 10**15, "shard_size": 1})
-    accounting.note(tmp_path, ["push"], of=2)
+    accounting.save_command(tmp_path, ["push"], of=2)
     said = accounting.missing(tmp_path, {1: 1})
     assert said is not None and "1 of 1000000000000000 episodes, shards 0, 2, 3, 4, 5, 6, 7, 8 and 9999" in said
     assert said.endswith(f"run `dipn-datagen push --out {tmp_path}`")
@@ -85,14 +85,14 @@ def test_of_many_missing_shards_some_are_named(tmp_path: pathlib.Path) -> None:
 
 def test_where_not_all_missing_shards_are_looked_at_the_command_makes_everything(tmp_path: pathlib.Path) -> None:
     files.write_json(tmp_path / "config.json", {"episodes": 40, "shard_size": 1})
-    accounting.note(tmp_path, ["push"], of=2)
+    accounting.save_command(tmp_path, ["push"], of=2)
     said = str(accounting.missing(tmp_path, dict.fromkeys(range(1, 19, 2), 1)))  # the first gaps are of one worker
     assert "shards 0, 2, 4, 6, 8, 10, 12, 14 and 23 more missing" in said and "--of" not in said
 
 
 def test_a_command_is_shown_on_one_line_and_as_a_shell_reads_it(tmp_path: pathlib.Path) -> None:
     files.write_json(tmp_path / "config.json", {"episodes": 8, "shard_size": 8})
-    accounting.note(tmp_path, ["grasp", "--grasp-net", "my runs/gn; x", "a\nb"], of=1)
+    accounting.save_command(tmp_path, ["grasp", "--grasp-net", "my runs/gn; x", "a\nb"], of=1)
     said = str(accounting.missing(tmp_path, {}))
     assert f"run `dipn-datagen grasp --grasp-net 'my runs/gn; x' 'a?b' --out {tmp_path}`" in said and "\n" not in said
 
@@ -156,7 +156,7 @@ def test_everybody_who_made_shards_is_listed_and_a_mix_is_said(
     (alone,) = records.summary(copy)["made_by"]
     assert (alone["processor"], alone["instructions"]) == (machine.processor(), machine.instructions())
     assert alone["shards"] == 2 and alone["versions"] == files.package_versions()
-    assert accounting.mixed([alone]) is None
+    assert accounting.describe_mixed_makers([alone]) is None
     monkeypatch.setattr(machine, "processor", lambda: "Abacus")
     monkeypatch.setattr(files, "package_versions", lambda: alone["versions"] | {"mujoco": "9.9"})
     episodes = shards.read_shard(shards.shard_path(copy, 1), kind="push")

@@ -112,7 +112,7 @@ def _command(*arguments: Any) -> int:
 def test_a_damaged_shard_is_one_line_wherever_it_is_read_and_is_set_aside(
     damage: str, copy: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    accounting.note(copy, ["push", "--episodes", "24"], of=1)
+    accounting.save_command(copy, ["push", "--episodes", "24"], of=1)
     path = shards.shard_path(copy, 1)
     change, says = DAMAGE[damage]
     path.write_bytes(change(path.read_bytes()))
