@@ -1,4 +1,4 @@
-"""The exception that a command turns into one line and exit code 2."""
+"""The exceptions that a command turns into one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -17,3 +17,7 @@ class UserError(Exception):
         """Keep the text on one line: what cannot be printed, as a line break in the name of a file, is shown as ?."""
         text = text.encode("utf-8", "backslashreplace").decode()
         super().__init__("".join(c if c.isprintable() else "?" for c in text))
+
+
+class InUse(UserError):
+    """Another process has a folder; it may be free later, also where that process was on a machine that is lost."""

@@ -159,6 +159,14 @@ PROMISES = (
         ("tests/dipn_jax/commands/test_launch.py::test_what_the_files_of_a_machine_do_is_tried_again_elsewhere",),
     ),
     Promise(
+        "A training whose machine a Ray cluster has lost is tried again while the file system keeps the lost machine's "
+        "lock on its folder, for up to eight minutes.",
+        (
+            "tests/dipn_jax/commands/test_launch.py::"
+            "test_a_folder_that_a_lost_machine_has_is_tried_again_until_its_lock_has_gone",
+        ),
+    ),
+    Promise(
         "In object storage each shard is kept once, however many workers make it, and a worker that is killed leaves "
         "complete shards only; the next worker completes the data set to that of one machine, byte for byte.",
         (

@@ -17,18 +17,30 @@ def _block(kind: str) -> str:
     return str(found)
 
 
-@pytest.mark.parametrize(("stopped", "code"), [(False, 0), (False, 2), (True, 130)])
-def test_the_script_of_an_array_hands_signals_on_and_queues_again_what_was_interrupted(
-    stopped: bool, code: int, tmp_path: pathlib.Path
+@pytest.mark.parametrize(
+    ("sent", "code", "queued"),
+    [
+        ((), 0, False),
+        ((), 2, False),
+        ((), 130, False),
+        ((signal.SIGUSR1,), 130, True),
+        ((signal.SIGTERM,), 130, False),
+        ((signal.SIGUSR1, signal.SIGTERM), 130, False),
+        ((signal.SIGUSR1,), 0, False),
+    ],
+)
+def test_the_script_of_an_array_queues_again_what_its_time_limit_stops_and_not_what_is_cancelled(
+    sent: tuple[signal.Signals, ...], code: int, queued: bool, tmp_path: pathlib.Path
 ) -> None:
-    """With a worker and a job manager that only say what they are told."""
+    """With a job manager and a worker that only say what they are told; this ends at the last signal."""
     script = _block("sh")
-    assert "#SBATCH --requeue" in script and "#SBATCH --signal=B:TERM@120" in script
+    assert "#SBATCH --requeue" in script and "#SBATCH --signal=B:USR1@120" in script
     programs = tmp_path / ".venv" / "bin"
     programs.mkdir(parents=True)
-    waits = "for i in $(seq 600); do sleep 0.05; done" if stopped else ""
+    hears = f"trap 'echo >> heard; [ $(wc -l < heard) -lt {len(sent)} ] || exit {code}' TERM"
+    waits = "for i in $(seq 600); do sleep 0.05; done" if sent else ""
     for path, text in (
-        (programs / "dipn-datagen", f"trap 'exit 130' TERM\necho \"$@\" > begun\n{waits}\nexit {code}"),
+        (programs / "dipn-datagen", f'{hears}\necho "$@" > begun\n{waits}\nexit {code}'),
         (tmp_path / "scontrol", 'echo "$@" > queued'),
     ):
         path.write_text(f"#!/bin/bash\n{text}\n")
@@ -36,14 +48,21 @@ def test_the_script_of_an_array_hands_signals_on_and_queues_again_what_was_inter
     (tmp_path / "job.sh").write_text(script)
     known = {"SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3", "SLURM_CPUS_PER_TASK": "4"}
     job = subprocess.Popen(["bash", "job.sh"], cwd=tmp_path, env=known | {"PATH": f"{tmp_path}:/usr/bin:/bin"})
-    while not (tmp_path / "begun").exists() or not (tmp_path / "begun").read_text():
-        time.sleep(0.01)
-    if stopped:
-        job.send_signal(signal.SIGTERM)
+    _wait_for_lines(tmp_path / "begun", 1)
+    for number, each in enumerate(sent, 1):
+        job.send_signal(each)
+        _wait_for_lines(tmp_path / "heard", number)
     assert job.wait(timeout=60) == code
     assert "--shard 3 --of 1000 --threads 4" in (tmp_path / "begun").read_text()
-    assert (tmp_path / "queued").exists() == stopped
-    assert not stopped or (tmp_path / "queued").read_text() == "requeue 7_3\n"
+    assert (tmp_path / "queued").exists() == queued
+    assert not queued or (tmp_path / "queued").read_text() == "requeue 7_3\n"
+
+
+def _wait_for_lines(path: pathlib.Path, lines: int) -> None:
+    until = time.monotonic() + 60
+    while not path.exists() or path.read_text().count("\n") < lines:
+        assert time.monotonic() < until, f"{path.name} has no {lines} lines"
+        time.sleep(0.01)
 
 
 def test_the_indexed_job_gives_up_an_index_whose_user_is_mistaken() -> None:

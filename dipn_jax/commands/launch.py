@@ -1,8 +1,8 @@
 """Tasks of a job, on the machines of a Ray cluster. Importing this imports neither Ray nor JAX.
 
 A task writes its result to the folder that all machines share, and returns a few words about it. One that is lost, with
-its process or its machine, or that a file system of its machine fails, is run again, up to RETRIES times; a mistake of
-the user's ends the job with its line.
+its process or its machine, that a file system of its machine fails, or whose folder a lost machine still has, is run
+again, up to RETRIES times; a mistake of the user's ends the job with its line.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, Literal
 
 from dipn_jax.commands import console
-from dipn_jax.errors import UserError
+from dipn_jax.errors import InUse, UserError
 from dipn_jax.system import addresses, machine
 from dipn_jax.system.interruption import STOP_SIGNALS
 
@@ -35,6 +35,9 @@ MACHINE_FILE_ERRORS = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT)
 """Errors of files that are the machine's own, too, where a UserError was made of them."""
 RETRY_PAUSE = 5.0
 """Seconds that a task waits which a machine's files have failed, or a broken machine would take the others' tasks."""
+IN_USE_PAUSE = 30.0
+"""Seconds that a task waits whose folder is in use, perhaps by itself on a machine that is lost. The lock of such a
+machine goes with its lease of NFS 4, by default after 90 s on Linux; RETRIES times this is eight minutes."""
 STORE_BYTES = 100 * 2**20
 """Memory for results of tasks, on a cluster that is started here: they are a few words."""
 PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
@@ -89,8 +92,8 @@ def run(
       fresh: give each task a process of its own, which ends with it.
 
     Raises:
-      UserError: a task raised it, its process died each time, or files of its machine failed each time, and the others
-        are given up; or there is no Ray or no cluster.
+      UserError: a task raised it, its process died each time, or each time files of its machine failed or its folder
+        was in use, and the others are given up; or there is no Ray or no cluster.
     """
     with _connected() as ray:
         _warn_of_too_little(ray, launch)
@@ -101,7 +104,7 @@ def run(
         shares = not fresh or launch.num_gpus < 1
         elsewhere = remote.options(scheduling_strategy="SPREAD")  # on one machine after another
         waiting, going = collections.deque(enumerate(tasks)), dict[Any, tuple[int, Any]]()
-        failed, broken = collections.Counter[int](), set[str]()
+        failed, named = collections.Counter[int](), set[str]()
         try:
             while waiting or going:
                 while waiting and len(going) < _window(ray, launch):
@@ -117,8 +120,8 @@ def run(
                     if failed[number] > RETRIES:
                         raise UserError(f"{function.__name__}: failed {RETRIES + 1} times, at last {ended.trouble}")
                     waiting.append((number, task))
-                    if ended.machine not in broken:
-                        broken.add(ended.machine)
+                    if ended.where not in named:
+                        named.add(ended.where)
                         console.warn(f"{function.__name__}: {ended.trouble}; tasks that fail there are run again")
         finally:
             for left in going:
@@ -131,8 +134,8 @@ class _Ended:
 
     result: Any = None
     mistake: str | None = None  # what the user has to mend
-    trouble: str | None = None  # what the files of its machine did
-    machine: str = ""
+    trouble: str | None = None  # what the files of its machine did, or who has its folder: it is run again
+    where: str = ""  # the machine or the folder of the trouble, which is named once
 
 
 def _ended(ray: Any, task: Any, function: Callable[..., Any]) -> _Ended:
@@ -158,6 +161,7 @@ def _share_gpu() -> None:
 def _attempt(function: Callable[..., Any], task: tuple[Any, ...], shares: bool) -> _Ended:
     """Return what a task returns, or the line that says what is wrong with the files; another error is raised.
 
+    A task that is to be run again waits first.
     It `shares` its GPU where another process may use that, too: one of another task, or one that waits for its next.
     """
     console.prepare()
@@ -166,6 +170,10 @@ def _attempt(function: Callable[..., Any], task: tuple[Any, ...], shares: bool) 
     here = socket.gethostname()
     try:
         return _Ended(function(*task))
+    except InUse as error:
+        said = addresses.with_urls(str(error))
+        time.sleep(IN_USE_PAUSE)
+        return _Ended(trouble=said, where=said)
     except UserError as error:
         # `from None` hides what it was made of, and keeps it
         passes = isinstance(error.__context__, OSError) and error.__context__.errno in MACHINE_FILE_ERRORS
@@ -178,7 +186,7 @@ def _attempt(function: Callable[..., Any], task: tuple[Any, ...], shares: bool) 
     if not passes:
         return _Ended(mistake=said)
     time.sleep(RETRY_PAUSE)
-    return _Ended(trouble=f"on {here}: {said}", machine=here)
+    return _Ended(trouble=f"on {here}: {said}", where=here)
 
 
 def _window(ray: Any, launch: Launch) -> int:

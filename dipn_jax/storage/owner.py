@@ -11,7 +11,7 @@ import socket
 from collections.abc import Iterator
 
 from dipn_jax.commands import console
-from dipn_jax.errors import UserError
+from dipn_jax.errors import InUse
 from dipn_jax.system import files, temporary, typed
 
 try:
@@ -30,7 +30,7 @@ def owned(out: pathlib.Path) -> Iterator[None]:
     and an owner of this host is looked for.
 
     Raises:
-      UserError: somebody else has it.
+      InUse: somebody else has it.
     """
     made = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
@@ -106,12 +106,10 @@ def _dead(path: pathlib.Path) -> bool:
     return not temporary.alive(pid)
 
 
-def _taken(path: pathlib.Path) -> UserError:
+def _taken(path: pathlib.Path) -> InUse:
     """Return the error that says who has the folder."""
     owner = _read(path)
     who = (
         ", ".join(f"{name} {owner[name]}" for name in ("host", "pid", "started") if name in owner) or "another process"
     )
-    return UserError(
-        f"{path.parent}: in use by {who}; wait for it or give another --out (if it is dead, delete {path})"
-    )
+    return InUse(f"{path.parent}: in use by {who}; wait for it or give another --out (if it is dead, delete {path})")

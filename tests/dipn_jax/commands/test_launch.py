@@ -1,11 +1,13 @@
 """Tasks that are lost are run again, and a user's mistake ends the job; with a stand-in for Ray."""
 
+import contextlib
 import errno
 import importlib.util
 import os
 import pathlib
 import socket
 import sys
+import time
 import types
 from typing import Any
 
@@ -16,6 +18,7 @@ from dipn_jax.eval import cli as evaluation
 from dipn_jax.commands import console, launch
 from dipn_jax.commands.launch import LOCAL, Launch
 from dipn_jax.errors import UserError
+from dipn_jax.storage import owner
 
 
 class _Ray(types.ModuleType):
@@ -133,6 +136,38 @@ def test_what_the_files_of_a_machine_do_is_tried_again_elsewhere(
     assert capsys.readouterr().err == f"warning: {line}; tasks that fail there are run again\n"
     with pytest.raises(UserError, match=f"^fails: failed {launch.RETRIES + 1} times, at last on .*: {what}$"):
         list(launch.run(fails, [(launch.RETRIES + 1,)], launch=Launch("ray")))
+
+
+@pytest.mark.parametrize("locks", [True, False])
+def test_a_folder_that_a_lost_machine_has_is_tried_again_until_its_lock_has_gone(
+    locks: bool, ray: _Ray, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The file systems here know no leases, so the lock is given up when tasks have waited for 90 s, without sleep."""
+    lost, waited = contextlib.ExitStack(), list[float]()
+
+    def sleep(seconds: float) -> None:
+        waited.append(seconds)
+        if sum(waited) >= 90 and not keeps:
+            lost.close()
+
+    def train(name: str) -> str:
+        with owner.owned(tmp_path / name):
+            return name
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    if not locks:
+        monkeypatch.setattr(owner, "fcntl", None)
+    tasks, keeps = [("a",), ("b",)], False
+    lost.enter_context(owner.owned(tmp_path / "a"))
+    assert dict(launch.run(train, tasks, launch=Launch("ray"), fresh=True)) == {0: "a", 1: "b"}
+    tries = len(waited)
+    assert 0 < tries < launch.RETRIES / 2 and ray.strategies == ["", "", *["SPREAD"] * tries]
+    line = f"{tmp_path / 'a'}: in use by host {socket.gethostname()}, pid {os.getpid()}, started 2"
+    warned = [each for each in capsys.readouterr().err.splitlines() if "in use" in each]
+    assert len(warned) == 1 and warned[0].startswith(f"warning: train: {line}")
+    keeps = True
+    with owner.owned(tmp_path / "a"), pytest.raises(UserError, match=f"^train: failed 17 times, at last {line}"):
+        list(launch.run(train, tasks, launch=Launch("ray"), fresh=True))
 
 
 def test_a_gpu_is_shared_unless_a_task_has_it_and_a_process_to_itself(

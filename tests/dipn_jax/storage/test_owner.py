@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from dipn_jax.train import log
 
-from dipn_jax.errors import UserError
+from dipn_jax.errors import InUse
 from dipn_jax.storage import owner
 from dipn_jax.system import temporary
 
@@ -36,7 +36,7 @@ def test_the_second_is_told_who_has_it_and_a_dead_owner_does_not_block(tmp_path:
     try:
         assert other.stdout is not None and other.stdout.readline() == "mine\n"
         who = f"in use by host {socket.gethostname()}, pid {other.pid}, started 2"
-        with pytest.raises(UserError, match=who), owner.owned(tmp_path):
+        with pytest.raises(InUse, match=who), owner.owned(tmp_path):
             pass
     finally:
         other.send_signal(signal.SIGKILL)
@@ -54,13 +54,13 @@ def test_without_locks_the_file_is_made_exclusively_and_that_is_said(
     (tmp_path / "run").mkdir()
     with owner.owned(tmp_path / "run"):
         assert "no locks" in capsys.readouterr().err
-        with pytest.raises(UserError, match=f"pid {os.getpid()}"), owner.owned(tmp_path / "run"):
+        with pytest.raises(InUse, match=f"pid {os.getpid()}"), owner.owned(tmp_path / "run"):
             pass
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     path = tmp_path / "run" / "owner.exclusive.json"
     path.write_text(json.dumps({"host": "elsewhere", "pid": ended.pid, "started": "today"}))
-    with pytest.raises(UserError, match="host elsewhere"), owner.owned(tmp_path / "run"):
+    with pytest.raises(InUse, match="host elsewhere"), owner.owned(tmp_path / "run"):
         pass
     path.write_text(json.dumps({"host": socket.gethostname(), "pid": ended.pid, "started": "today"}))
     with owner.owned(tmp_path / "run"):
@@ -72,7 +72,7 @@ def test_a_system_without_file_locks_has_owners_all_the_same(
 ) -> None:
     monkeypatch.setattr(owner, "fcntl", None)
     monkeypatch.setattr(log, "resource", None)
-    with owner.owned(tmp_path / "run"), pytest.raises(UserError, match="in use"), owner.owned(tmp_path / "run"):
+    with owner.owned(tmp_path / "run"), pytest.raises(InUse, match="in use"), owner.owned(tmp_path / "run"):
         pass
     assert not (tmp_path / "run").exists() and log._peak() == {}
 
