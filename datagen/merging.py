@@ -66,7 +66,7 @@ def _require_apart(places: Sequence[pathlib.Path], out: pathlib.Path) -> None:
 
 def _entries(folder: pathlib.Path) -> list[Entry]:
     """Return the shards of a data set, each of which is whole."""
-    found = records.whole(folder, kind=str(records.summary(folder)["kind"]))
+    found = records.checked_entries(folder, kind=str(records.summary(folder)["kind"]))
     paths = {typed.inside(folder, name): entry["sha256"] for name, entry in found.items()}
     return [Entry(path, sha256, shards.read_meta(path)) for path, sha256 in paths.items()]
 

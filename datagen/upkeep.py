@@ -28,7 +28,7 @@ def verify(folder: tyro.conf.Positional[Place]) -> None:
     from dipn_jax.storage import mirror, records
 
     folder = mirror.local(folder)
-    problems, mixed = records.examined(folder)
+    problems, mixed = records.verify_with_makers(folder)
     if mixed:
         console.warn(mixed)
     if problems:

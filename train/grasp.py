@@ -227,7 +227,7 @@ class GraspTask:
         def make(index: np.ndarray) -> Window:
             return self.prepare(episodes.take(index))
 
-        return ExampleStore(make, len(episodes), space=space, about=self.fingerprint)
+        return ExampleStore(make, len(episodes), space=space, about=f"{self.fingerprint}:{self.network_config}")
 
     def prepare(self, episodes: GraspEpisode) -> Window:
         """Return windows `[B]` of episodes `[B]` as NumPy arrays."""

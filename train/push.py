@@ -90,7 +90,7 @@ class PushTask:
         def make(index: np.ndarray) -> Example:
             return _halved(self.prepare(episodes.take(index)))
 
-        return ExampleStore(make, len(episodes), space=space, about=self.fingerprint)
+        return ExampleStore(make, len(episodes), space=space, about=f"{self.fingerprint}:{self.network_config}")
 
     def fetch(self, index: np.ndarray) -> Example:
         """See `loop.Task`. A `compact` network's examples are small (20 KB), and kept once they have been rendered."""

@@ -59,10 +59,10 @@ def verify(folder: pathlib.Path) -> Problems:
 
     Those that the manifest does not list are read to their end.
     """
-    return examined(folder)[0]
+    return verify_with_makers(folder)[0]
 
 
-def examined(folder: pathlib.Path) -> tuple[Problems, str | None]:
+def verify_with_makers(folder: pathlib.Path) -> tuple[Problems, str | None]:
     """Return what `verify` does, and in one line what differs between those who made the shards that are whole."""
     return _said(folder, _looks(folder))
 
@@ -78,7 +78,7 @@ def _looks(folder: pathlib.Path) -> list[tuple[pathlib.Path, Look]]:
 
 
 def _said(folder: pathlib.Path, looks: list[tuple[pathlib.Path, Look]]) -> tuple[Problems, str | None]:
-    """Return what `examined` does."""
+    """Return what `verify_with_makers` does, of what was seen."""
     mixed = accounting.describe_mixed_makers(accounting.makers([meta for _, (_, meta) in looks if meta is not None]))
     return [(path, what) for path, (what, _) in looks if what], mixed and f"{folder}: {mixed}"
 
@@ -108,7 +108,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     except UserError:
         known = {}
     removed = []
-    looks = [(path, _judged(path, known.get(path.name))) for path in shards.shard_files(folder)]
+    looks = [(path, _check_listed(path, known.get(path.name))) for path in shards.shard_files(folder)]
     for path, (what, _) in _of_one_kind(looks):
         if what:
             files.move(path, path.with_suffix(".parquet.damaged"))
@@ -118,7 +118,7 @@ def repair(folder: pathlib.Path) -> list[pathlib.Path]:
     return removed
 
 
-def _judged(path: pathlib.Path, entry: dict[str, Any] | None) -> Look:
+def _check_listed(path: pathlib.Path, entry: dict[str, Any] | None) -> Look:
     """Check that a shard is the one that the manifest lists, and read it to its end; return as `_look` does."""
     if entry is not None and (not path.is_file() or files.file_sha256(path) != entry["sha256"]):
         return "not the one that the manifest lists", None
@@ -207,7 +207,7 @@ def load(folder: pathlib.Path, *, kind: str, space: Space | None = None) -> tupl
 
 
 def opened(folder: pathlib.Path, *, kind: str) -> DataSet:
-    """Check every shard of a data set, as `checked` does, and return it; none of its episodes is read.
+    """Check every shard of a data set and return it; none of its episodes is read.
 
     Args:
       folder: the data set.
@@ -238,23 +238,8 @@ def fingerprint(entries: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps([entry["sha256"] for entry in entries.values()]).encode()).hexdigest()
 
 
-def checked(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
-    """Return the entry of every shard of a data set, which has one at least, after checking each.
-
-    One line says where those who made them differ, and one where episodes that were asked for have not been made.
-
-    Args:
-      folder: the data set.
-      kind: of its episodes, for the message that says how to make some.
-
-    Raises:
-      UserError: no such data set, or a shard is missing or damaged.
-    """
-    return _checked(folder, kind=kind)[0]
-
-
 def _checked(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], Metas]:
-    """Return the entries of a data set as `checked` does, and the metadata of its shards."""
+    """Return entries and metadata as `_whole` does, and say where makers differ and what was asked for but not made."""
     found, metas, mixed = _whole(folder, kind=kind)
     if mixed:
         console.warn(mixed)
@@ -267,13 +252,21 @@ def _checked(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], Metas]
     return found, metas
 
 
-def whole(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
-    """Return the entries of a data set as `checked` does, and say nothing of what is missing or differs."""
+def checked_entries(folder: pathlib.Path, *, kind: str) -> dict[str, Any]:
+    """Return the entry of every shard of a data set, which has one at least, after checking each.
+
+    Args:
+      folder: the data set.
+      kind: of its episodes, for the message that says how to make some.
+
+    Raises:
+      UserError: no such data set, or a shard is missing or damaged.
+    """
     return _whole(folder, kind=kind)[0]
 
 
 def _whole(folder: pathlib.Path, *, kind: str) -> tuple[dict[str, Any], Metas, str | None]:
-    """Return entries and metadata of a data set, and what differs between those who made it; as `checked` otherwise."""
+    """Return entries and metadata of a data set, and what differs between those who made it; see `checked_entries`."""
     looks = _looks(folder)
     problems, mixed = _said(folder, looks)
     if problems:

@@ -111,9 +111,9 @@ def clear(
     from . import lockstep
 
     seed = given["seed"]
-    partial: resume.Partial = resume.Partial(out, given, inputs=inputs(runs, tables), part=share.named())
+    partial: resume.Partial = resume.Partial(out, given, inputs=inputs(runs, tables), part=share.number_and_count())
     with owner.owned(out):
-        if shares.made(out, kind, share, partial):
+        if shares.is_made(out, kind, share, partial):
             return {}
         instances = tables.make(physics, seed=seed)
         rows = share.rows(len(instances))

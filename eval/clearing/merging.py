@@ -40,7 +40,7 @@ def tables(parts: Sequence[Part], out: pathlib.Path) -> list[Outcome]:
     for part in parts:
         lines = files.read_json(part.path(EPISODES), wanted=[EPISODE])
         if len(lines) != len(part.rows()):
-            raise UserError(f"{part.folder / EPISODES}: {len(lines)} tables, want {len(part.rows())}; {part.again()}")
+            raise UserError(f"{part.folder / EPISODES}: {len(lines)} tables, want {len(part.rows())}; {part.advice()}")
         listed |= {row: (part, line) for row, line in zip(part.rows(), lines, strict=True)}
     ordered = [listed[row] for row in sorted(listed)]
     for part, line in ordered:

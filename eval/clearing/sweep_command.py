@@ -99,13 +99,13 @@ def sweep(
     networks = Networks(push_net, grasp_net)
     physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
     inputs = evaluation.inputs(networks.runs("dipn+gn"), tables)
-    kept = resume.Partial(out, given, inputs=inputs, part=share.named())
+    kept = resume.Partial(out, given, inputs=inputs, part=share.number_and_count())
     if launch.uses_cluster:
         launching.evaluate("sweep", asked, kept)
         return
     command = command_line.words(sweep, asked, without=command_line.WORKER_OPTIONS)
     with owner.owned(out):
-        if shares.made(out, "sweep", share, kept):
+        if shares.is_made(out, "sweep", share, kept):
             return
         clear = functools.partial(evaluation.clear, share=share, kind="sweep", command=command)
         values = _clear_with_each(clear, out, configs, networks, physics, tables, camera, given=given, kept=kept)

@@ -84,7 +84,7 @@ def grasp(
 
     config, single = (scenes.parse_objects(count, ranges=ranges) for count in (objects, "1"))
     run = checkpoint.find(grasp_net, network="grasp") if grasp_net else None
-    partial = resume.Partial(out, settings, inputs=[run] if run else [], part=share.named())
+    partial = resume.Partial(out, settings, inputs=[run] if run else [], part=share.number_and_count())
     online = curves.grasp_summary(curves.load_grasp_runs(curve)) if curve else None
     if run:
         physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
@@ -93,7 +93,7 @@ def grasp(
         launching.evaluate("grasp", asked, partial)
         return
     with owner.owned(out):
-        if shares.made(out, "grasp", share, partial):
+        if shares.is_made(out, "grasp", share, partial):
             return
         if run:
             found, tables = success.tried(

@@ -42,7 +42,7 @@ def pooled(parts: Sequence[Part]) -> Arrays:
         try:
             found.append(arrays.read(part.path(TRIED), rates.FORMS))
         except typed.Misfit as error:
-            raise UserError(f"{part.folder / TRIED}: damaged, {error}; {part.again()}") from None
+            raise UserError(f"{part.folder / TRIED}: damaged, {error}; {part.advice()}") from None
     joined = {name: np.concatenate([each[name] for each in found]) for name in rates.FORMS}
     for order in _ORDERS:
         size = rates.FORMS[order].shape
@@ -57,7 +57,7 @@ def merge(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:
     try:
         about = typed.check(part.about, {"others": typed.Whole(), "online": typed.Maybe({str: float})})
     except typed.Misfit as error:
-        raise UserError(f"{part.folder / PART}: damaged, {error}; {part.again()}") from None
+        raise UserError(f"{part.folder / PART}: damaged, {error}; {part.advice()}") from None
     found, tables = pooled(parts), clearing.tables(parts, out)
     return finish(out, found, tables, others=about["others"], online=about["online"])
 

@@ -73,13 +73,13 @@ def predict(
 
     config = scenes.parse_objects(objects, ranges=ranges)
     networks, compared, runs = _load(push_net, curve)
-    partial = resume.Partial(out, settings, inputs=runs, part=share.named())
+    partial = resume.Partial(out, settings, inputs=runs, part=share.number_and_count())
     truth = make_engine(engine, threads=threads)
     if launch.uses_cluster:
         launching.evaluate("prediction", asked, partial)
         return
     with owner.owned(out):
-        if shares.made(out, "prediction", share, partial):
+        if shares.is_made(out, "prediction", share, partial):
             return
         rows, films = push_errors.measured(
             networks,

@@ -60,13 +60,13 @@ def merge(parts: Sequence[Part], out: pathlib.Path) -> dict[str, Any]:
         if not {"group", "visible", "moved"} <= set(about["arrays"]):
             raise typed.Misfit("arrays are missing")
     except typed.Misfit as error:
-        raise UserError(f"{first.folder / PART}: damaged, {error}; {first.again()}") from None
+        raise UserError(f"{first.folder / PART}: damaged, {error}; {first.advice()}") from None
     rows = pooled(parts, about["arrays"])
     files.write_atomically(out / FILMS, files.read_bytes(first.path(FILMS)))
     try:
         return finish(out, rows, about["compared"])
     except KeyError as error:
-        raise UserError(f"{first.folder / PART}: damaged, {error} is missing; {first.again()}") from None
+        raise UserError(f"{first.folder / PART}: damaged, {error} is missing; {first.advice()}") from None
 
 
 def finish(out: pathlib.Path, rows: Mapping[str, np.ndarray], compared: Sequence[str]) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def evaluate(kind: str, asked: Mapping[str, Any], partial: resume.Partial) -> No
     where: Launch = asked["launch"]
     every = [Share(shard, asked["share"].of) for shard in range(asked["share"].of)]
     with owner.owned(out):
-        todo = [share for share in every if not shares.made(place(out, share), kind, share, partial, quiet=True)]
+        todo = [share for share in every if not shares.is_made(place(out, share), kind, share, partial, quiet=True)]
         given = {**asked, "launch": LOCAL, "threads": where.threads(asked["threads"])}
         tasks = [(kind, {**given, "share": share}) for share in todo]
         with (

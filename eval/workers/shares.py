@@ -66,7 +66,7 @@ class Share:
             raise UserError(f"--of {self.of}: more workers than the {total} that can be shared; want at most {total}")
         return range(self.shard or 0, total, self.of)
 
-    def named(self) -> tuple[int, int] | None:
+    def number_and_count(self) -> tuple[int, int] | None:
         """Return number and count of the part; None where everything is made."""
         return None if self.shard is None else (self.shard, self.of)
 
@@ -105,13 +105,13 @@ class Part:
           UserError: it is missing or damaged, or not listed.
         """
         if name not in self.files:
-            raise UserError(f"{self.folder / PART}: lists no {name}; {self.again()}")
+            raise UserError(f"{self.folder / PART}: lists no {name}; {self.advice()}")
         path = typed.inside(self.folder, name)
         if not path.is_file() or files.file_sha256(path) != self.files[name]:
-            raise UserError(f"{path}: missing, or damaged since it was written; {self.again()}")
+            raise UserError(f"{path}: missing, or damaged since it was written; {self.advice()}")
         return path
 
-    def again(self) -> str:
+    def advice(self) -> str:
         """Return in words what to do about a part that cannot be used."""
         return f"delete {self.folder / PART} and run its command again"
 
@@ -179,12 +179,12 @@ def pooled(parts: Sequence[Part], name: str, forms: Mapping[str, Form], *, by: s
         try:
             found.append(arrays.read(part.path(name), forms))
         except typed.Misfit as error:
-            raise UserError(f"{part.folder / name}: damaged, {error}; {part.again()}") from None
+            raise UserError(f"{part.folder / name}: damaged, {error}; {part.advice()}") from None
     places = np.argsort(np.concatenate([each[by] for each in found]), kind="stable")
     return {key: np.concatenate([each[key] for each in found])[places] for key in forms}
 
 
-def made(out: pathlib.Path, kind: str, share: Share, partial: resume.Partial, *, quiet: bool = False) -> bool:
+def is_made(out: pathlib.Path, kind: str, share: Share, partial: resume.Partial, *, quiet: bool = False) -> bool:
     """Return whether the part of this worker is in its folder already, whole; a line says so, if not `quiet`.
 
     Raises:
