@@ -179,10 +179,11 @@ PROMISES = (
     Promise(
         "A training shared by devices or processes learns what one device learns, up to rounding; interrupting one "
         "process ends all of them with a checkpoint, from which any number of devices can continue. If one is killed, "
-        "the others end, and the last checkpoint is whole.",
+        "the others end, and the last checkpoint is whole. If one was given other data, all are told so at once.",
         (
             "tests/train/test_devices.py::test_four_devices_learn_what_one_does_and_one_goes_on_from_there",
             "tests/train/test_devices.py::test_a_process_that_is_killed_ends_the_others_and_nothing_saved_is_lost",
+            "tests/train/test_devices.py::test_processes_with_other_data_are_told_so_before_anything_is_written",
         ),
     ),
     Promise(
