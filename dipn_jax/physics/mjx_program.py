@@ -150,7 +150,10 @@ class Program:
         }
 
     def _hulls(self, parts: Any) -> Any:
-        """Return the hulls of all geoms: of the gripper's boxes (`narrow` reads them), then `parts [3 N, ...]`."""
+        """Return the hulls of all geoms: of the gripper's boxes (`narrow` reads them), then `parts [3 N, ...]`.
+
+        The first row is of the floor; it has no size, and nothing reads it.
+        """
         sides = 2 * self.base.geom_size[: self.first_geom]
         boxes = jax.vmap(functools.partial(prisms.parts, shapes.CLASSES.index("cuboid")))(sides).mesh
         return jax.tree.map(lambda box, part: jnp.concatenate([box[:, 0], part]), boxes, parts)

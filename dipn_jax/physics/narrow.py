@@ -1,9 +1,10 @@
 """Contacts of traced hulls as one GPU kernel: a warp of 32 threads a pair of geoms, and a pair that is apart ends.
 
-XLA computes every step of `colliders` for all pairs that the broad phase keeps, with 36 edges and 14 faces where a
-cuboid has 12 and 6, and tests the edges of the most overlapping pairs only. The kernel (`narrow_kernel.py`, made of C++
-by NVIDIA Warp) leaves out repeated corners, faces and edges, stops at bounding balls or along a face where two hulls
-are apart, and tests the edges of all pairs that are left. Its rules, so its contacts, are those of `colliders`.
+XLA computes the face gaps of all pairs that the broad phase keeps, and the rest of `colliders` for the most overlapping
+ones, an object's cuboid with 36 edges and 14 faces where 12 and 6 are distinct. The kernel (`narrow_kernel.py`, made of
+C++ by NVIDIA Warp) leaves out repeated corners, faces and edges, stops at bounding balls or along a face where two
+hulls are apart, and tests the edges of all pairs that are left. Its rules are those of `colliders`; of more than four
+corners of a contact with a box it may choose other four, because the box's corners are counted from another one.
 
 It belongs to the solver `warp` of the engine `mjx` (`PhysicsConfig.solver`); on a CPU the same source runs with one
 thread. Boxes have to be among the traced hulls (`mjx_program`).
@@ -77,12 +78,13 @@ def _call(geoms: int, pairs: int, planes: bool) -> Callable[..., Any]:
     kernel, size = native.kernel(), CONTACTS_PER_PAIR * pairs
     # the name of the call in a program is made of this, and its number is 0 where it is traced once: the same in every
     # process, so that XLA finds what it compiled in another
-    kernel.func.__qualname__ = f"narrow_{geoms}_{pairs}_{int(planes)}"
+    name = f"narrow_{geoms}_{pairs}_{int(planes)}"
+    kernel.func.__qualname__ = name
     call = jax_kernel(
         kernel,
         num_outputs=3,
         launch_dims=(pairs, native.LANES),
-        output_dims={"distance": size, "position": 3 * size, "frame": 9 * size},
+        output_dims={"distance": size, "position": 3 * size, "frame": 9 * size, name: 0},  # the last tells calls apart
         block_dim=native.LANES,
     )
     return jax.jit(lambda *leaves: call(*leaves, geoms, pairs, int(planes)))

@@ -17,7 +17,8 @@
         sync();
     }
 
-    // Return the axis of two edges, of any length, and their gap along it; none unless they can be a contact.
+    // Return the gap of two edges along their common normal, which goes into `axis` (unit, from the first hull); -inf,
+    // and any axis, unless they can be a contact.
     CUDA_CALLABLE float edge_gap(int e, int f, const Vector& center, Vector& axis) const
     {
         const Hull &a = s.hull[0], &b = s.hull[1];
@@ -147,13 +148,12 @@ if (is_plane) {
     }
     limit = TOUCHING - shared.best(lowest).value;
     lift = -0.5f;
-    shared.sync();  // `best` does not wait for shared memory on a GPU
 } else {
     shared.place(0, vertex.data + 3 * VERTICES * first, face_normal.data + 3 * FACES * first, turn, shift);
     Best gap_a { -INFINITY, 0 }, gap_b { -INFINITY, 0 };
     shared.face_gaps(gap_a, gap_b);
     const float gap = wp::max(gap_a.value, gap_b.value);
-    if (!(gap < 0.0f)) {
+    if (!(gap < 0.0f && gap > -INFINITY)) {  // -inf: turned by what is no number
         output.apart();
         return;
     }

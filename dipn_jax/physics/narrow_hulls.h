@@ -64,8 +64,8 @@ struct Best {
 // Edges: lower ring, upper ring, c rises.
 struct Hull {
     Vector vertex[VERTICES], normal[FACES];
-    Vector direction[EDGES], along[EDGES];  // unit vector; cross product of the normals of both faces
-    float side[EDGES][FACES];  // `along` times the normals of the other hull
+    Vector direction[EDGES];  // unit vectors
+    float side[EDGES][FACES];  // cross product of the normals of both faces, times the normals of the other hull
     int c;
 
     CUDA_CALLABLE int after(int k) const { return k + 1 < c ? k + 1 : 0; }
@@ -117,6 +117,7 @@ struct Shared {
     CUDA_CALLABLE Best best(Best mine) const
     {
 #if defined(__CUDA_ARCH__)
+        __syncwarp();  // so that what lanes wrote before is seen after it, as on the CPU
         for (int far = LANES / 2; far > 0; far /= 2)
             mine.offer(
                 __shfl_xor_sync(0xffffffffu, mine.value, far), __shfl_xor_sync(0xffffffffu, mine.index, far)

@@ -168,8 +168,9 @@ def test_the_kernel_finds_the_contacts_of_xla(placed: tuple[Any, np.ndarray, np.
     deepest, touches = found[0].min(-1), found[0] < 0
     np.testing.assert_allclose(deepest, wanted[0].min(-1), atol=ROUNDING)
     touching = touches.any(-1)
-    edges, kinds = touches.sum(-1) == 1, shapes.CLASSES
-    assert 200 < touching.sum() < 350 and edges.sum() > 50 and (touches.sum(-1) == 4).sum() > 100 and len(kinds) == 5
+    edges, each = touches.sum(-1) == 1, np.arange(PAIRS)
+    assert 200 < touching.sum() < 350 and edges.sum() > 50 and (touches.sum(-1) == 4).sum() > 100
+    assert len(np.unique(np.stack([each % 5, each // 5 % 5])[:, touching])) == len(shapes.CLASSES)
     np.testing.assert_allclose(found[2][touching], wanted[2][touching], atol=1e-5)
     half = 0.5 * found[0][..., None] * found[2][:, :, 0]
     for hull, sign in ((first, -1), (second, 1)):
@@ -201,6 +202,7 @@ def test_the_kernel_finds_the_contacts_of_a_plane(placed: tuple[Any, np.ndarray,
         assert touches.any(-1).sum() > 100 and (touches.all(-1).sum() > 20 or mat[0, 0] < 1)
         np.testing.assert_allclose(found[2][touches], wanted[2][touches], atol=1e-6)
         np.testing.assert_allclose(found[0].min(-1), wanted[0].min(-1), atol=colliders.TOUCHING_HEIGHT)
+        assert ((wanted[0] < 0).sum(-1) == touches.sum(-1)).mean() > 0.97, "contacts are lost"
         for got, want in zip(found[:2], wanted[:2], strict=True):
             assert (np.abs(got - want)[touches] < ROUNDING).mean() > 0.97, "all but where corners tie"
 
@@ -250,29 +252,38 @@ def test_what_is_far_dead_or_nowhere_has_finite_numbers(placed: tuple[Any, np.nd
         np.testing.assert_array_equal(found[2], np.broadcast_to(np.eye(3), found[2].shape))
 
 
-def _launched(arrays: tuple[Any, ...], lanes: int) -> list[np.ndarray]:
+def test_calls_of_any_size_are_the_first_of_their_name() -> None:
+    """Where they are not, another process has another program, and compiles it again."""
+    for geoms in (7, 9):
+        some = [jnp.zeros((geoms, *shape)) for shape in ((24, 3), (14, 3), (), (3,), (3, 3))]
+        text = jax.jit(narrow.contacts).lower(*some, jnp.zeros((5, 2), jnp.int32)).as_text()
+        assert f"@narrow_{geoms}_5_0_0(" in text and "launch_id = 0 " in text
+
+
+def _launched(arrays: tuple[Any, ...], lanes: int, *, planes: bool) -> list[np.ndarray]:
     """Return what the kernel gives, launched with that many lanes on the CPU."""
     import warp
 
     native, count = narrow.load(), len(arrays[-1])
     inputs = [warp.array(x.ravel(), dtype=warp.int32 if x.dtype.kind == "i" else float) for x in arrays]
     out = [warp.zeros(4 * size * count, dtype=float) for size in (1, 3, 9)]
-    inputs += [len(arrays[0]), count, 0, *out]
+    inputs += [len(arrays[0]), count, int(planes), *out]
     warp.launch(native.kernel(), dim=(count, native.LANES), inputs=inputs, block_dim=lanes, device="cpu")
     return [x.numpy() for x in out]
 
 
+@pytest.mark.parametrize("planes", [False, True])
 def test_lanes_wait_for_one_another(
-    placed: tuple[Any, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    planes: bool, placed: tuple[Any, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fibers run one after the other up to each barrier, so where one is missing they read what is not there yet."""
     import warp
 
     arrays = _arrays(*placed[:2], np.arange(2 * PAIRS).reshape(-1, 2))
-    alone = _launched(arrays, 1)
+    alone = _launched(arrays, 1, planes=planes)
     monkeypatch.setattr(warp.config, "enable_cpu_blocks", True)
-    together = _launched(arrays, 32)
-    for ours, theirs, again in zip(together, alone, _launched(arrays, 32), strict=True):
+    together = _launched(arrays, 32, planes=planes)
+    for ours, theirs, again in zip(together, alone, _launched(arrays, 32, planes=planes), strict=True):
         np.testing.assert_array_equal(ours, theirs)
         np.testing.assert_array_equal(ours, again)
 
