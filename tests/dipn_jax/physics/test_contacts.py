@@ -12,7 +12,6 @@ import pytest
 
 from dipn_jax import geometry
 from dipn_jax.physics import colliders, mjx, narrow, prisms
-from dipn_jax.physics.mjx_program import Program
 from dipn_jax.structs import Scene
 from dipn_jax.world import model, shapes
 
@@ -251,17 +250,6 @@ def test_what_is_far_dead_or_nowhere_has_finite_numbers(placed: tuple[Any, np.nd
         found = jax.device_get(narrow.contacts(*_arrays(hulls.replace(pos=pos), dead, pairs), planes=planes))
         assert (found[0] == colliders.APART_DISTANCE).all() and (found[1] == 0).all()
         np.testing.assert_array_equal(found[2], np.broadcast_to(np.eye(3), found[2].shape))
-
-
-def test_the_hulls_of_the_grippers_boxes_are_these_boxes() -> None:
-    program = Program(mjx.DEFAULTS, 1, substeps=1)
-    scene, _ = _random_pairs(1)
-    corners = program._fields(jax.tree.map(lambda leaf: jnp.asarray(leaf[0, :1]), scene))["_impl.mesh_convex"][0].vert
-    size, radius = np.asarray(program.base.geom_size), np.asarray(program.base.geom_rbound)
-    assert program.first_geom > 3
-    for geom in range(1, program.first_geom):  # the first is the floor
-        np.testing.assert_allclose(np.abs(corners[geom]).max(0), size[geom], rtol=1e-6)
-        np.testing.assert_allclose(np.linalg.norm(corners[geom], axis=-1).max(), radius[geom], rtol=1e-6)
 
 
 def test_calls_of_any_size_are_the_first_of_their_name() -> None:
