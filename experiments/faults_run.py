@@ -30,8 +30,10 @@ class Case:
     """A small command whose faults are tried."""
 
     name: str
-    words: tuple[str, ...]  # `{data}` stands for the folder of what it reads
-    needs: tuple[tuple[str, tuple[str, ...]], ...] = ()  # what it reads: names in that folder, and commands
+    words: tuple[str, ...]  # `{data}` stands for the folder of its inputs
+    needs: tuple[
+        tuple[str, tuple[str, ...]], ...
+    ] = ()  # its inputs: names in that folder, and the commands that make them
     points: int = 40  # faults that are tried
 
 

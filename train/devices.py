@@ -59,7 +59,7 @@ class OneDevice:
         """Wait until all processes are at the place `name`."""
 
     def require_alike(self, given: dict[str, Any], *, what: str) -> None:
-        """Check that all processes give the same dictionary, which has to fit into JSON; `what` says of what it is.
+        """Check that all processes give the same dictionary, which has to fit into JSON; `what` names it in errors.
 
         Raises:
           UserError: they do not; in every process.

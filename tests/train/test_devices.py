@@ -70,7 +70,7 @@ sys.exit("was not interrupted")
 """
 """DIPN learns on four devices of two processes; the second one gets a signal at its fifth step, which ends both.
 
-With "other data" in the place of a signal, the second process learns from other episodes.
+Where `sent` is "other data" and no signal, the second process learns from fewer episodes.
 """
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from object_sizes import SIZES
 
 from dipn_jax import geometry
 from dipn_jax.physics import colliders, mjx, narrow, prisms
@@ -29,13 +30,6 @@ MOST_REGISTERS = 96
 """With more, fewer than 20 warps fit a multiprocessor (65,536 registers)."""
 MOST_SHARED = 11 * 1024
 """Bytes of a pair; with more, fewer than 20 warps fit a multiprocessor."""
-SIZES = {
-    "cuboid": (0.06, 0.05, 0.04),
-    "cylinder": (0.048, 0.05, 0.048),
-    "half_cylinder": (0.05, 0.05, 0.025),
-    "triangular_prism": (0.06, 0.05, 0.04),
-    "concave": (0.05, 0.05, 0.09),
-}
 
 
 def _random_pairs(count: int) -> tuple[Scene, np.ndarray]:
@@ -250,6 +244,10 @@ def test_what_is_far_dead_or_nowhere_has_finite_numbers(placed: tuple[Any, np.nd
         found = jax.device_get(narrow.contacts(*_arrays(hulls.replace(pos=pos), dead, pairs), planes=planes))
         assert (found[0] == colliders.APART_DISTANCE).all() and (found[1] == 0).all()
         np.testing.assert_array_equal(found[2], np.broadcast_to(np.eye(3), found[2].shape))
+    mat = np.array(hulls.mat)
+    pos[:2], mat[0] = 0, np.nan
+    frames = narrow.contacts(*_arrays(hulls.replace(pos=pos, mat=mat), dead, pairs[:1]))[2]
+    np.testing.assert_array_equal(frames, np.broadcast_to(np.eye(3), frames.shape))
 
 
 def test_calls_of_any_size_are_the_first_of_their_name() -> None:

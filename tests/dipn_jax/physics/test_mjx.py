@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from mujoco.mjx._src.types import GeomType
+from object_sizes import SIZES
 
 from dipn_jax.errors import UserError
 from dipn_jax.physics import blocks, mjx, narrow
@@ -32,13 +33,6 @@ POSITION_TOLERANCE = 0.003
 FALL_SECONDS = 0.1
 """Seconds in which a heap falls: its objects hit one another, and engines are 1 mm apart (10 mm at 0.2 s)."""
 CLASS = {name: i for i, name in enumerate(shapes.CLASSES)}
-SIZES = {
-    "cuboid": (0.06, 0.05, 0.04),
-    "cylinder": (0.048, 0.05, 0.048),
-    "half_cylinder": (0.05, 0.05, 0.025),
-    "triangular_prism": (0.06, 0.05, 0.04),
-    "concave": (0.05, 0.05, 0.09),
-}
 LINES = (
     ("cuboid", "concave", "cylinder"),
     ("concave", "half_cylinder", None),
