@@ -153,7 +153,7 @@ if (is_plane) {
     Best gap_a { -INFINITY, 0 }, gap_b { -INFINITY, 0 };
     shared.face_gaps(gap_a, gap_b);
     const float gap = wp::max(gap_a.value, gap_b.value);
-    if (!(gap < 0.0f && gap > -INFINITY)) {  // -inf: turned by what is no number
+    if (!(gap < 0.0f)) {
         output.apart();
         return;
     }
