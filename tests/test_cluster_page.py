@@ -32,8 +32,12 @@ def _block(kind: str) -> str:
 def test_the_script_of_an_array_queues_again_what_its_time_limit_stops_and_not_what_is_cancelled(
     sent: tuple[signal.Signals, ...], code: int, queued: bool, tmp_path: pathlib.Path
 ) -> None:
-    """With a job manager and a worker that only say what they are told; this ends at the last signal."""
-    script = _block("sh")
+    """With a job manager and a worker that only say what they are told; this ends at the last signal.
+
+    The shell is made slow where it has begun the worker, so that the first signal finds it there.
+    """
+    script = _block("sh").replace(" &\n", " &\nsleep 0.3\n")
+    assert script.count("sleep") == 1
     assert "#SBATCH --requeue" in script and "#SBATCH --signal=B:USR1@120" in script
     programs = tmp_path / ".venv" / "bin"
     programs.mkdir(parents=True)
