@@ -2,7 +2,6 @@
 
 import pathlib
 import shutil
-import signal
 import subprocess
 import sys
 from typing import Any
@@ -143,24 +142,6 @@ def test_what_is_there_of_somebody_else_stays_and_is_one_line(
     assert {content for name, content in _bytes(there).items() if "shard" in name} == {b"theirs"}
 
 
-KILLED = """
-import os, signal, sys, threading
-from dipn_jax.datagen import cli
-from dipn_jax.commands import console
-from dipn_jax.storage.objects import Bucket
-create, made, turn = Bucket.create, [], threading.Lock()
-def creating(self, name, data):
-    with turn:
-        if name.startswith("shard") and len(made) == 2:
-            os.kill(os.getpid(), signal.SIGKILL)
-        made.extend([name] * name.startswith("shard"))
-        return create(self, name, data)
-Bucket.create = creating
-sys.exit(console.run("test", cli.COMMANDS, sys.argv[1:]))
-"""
-"""A command that is killed before it would create its third shard."""
-
-
 @pytest.mark.slow
 def test_a_merge_that_is_killed_goes_on_and_racing_ones_create_each_shard_once(
     sets: tuple[pathlib.Path, pathlib.Path], whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
@@ -172,8 +153,7 @@ def test_a_merge_that_is_killed_goes_on_and_racing_ones_create_each_shard_once(
             if not path.name.startswith("."):
                 s3_server.client().put_object(Bucket="bucket", Key=f"two/{path.name}", Body=path.read_bytes())
         words = ["merge", str(sets[0]), "s3://bucket/two", "--out", "s3://bucket/joined"]
-        killed = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True)
-        assert killed.returncode == -signal.SIGKILL, killed.stderr
+        s3_server.kill_at_third_shard(words)
         left = s3_server.contents("joined")
         assert len(left) == 3 and left.items() <= whole.items() and "manifest.json" not in left
         assert merge(*sets[::-1], "--out", "s3://bucket/joined") == 2, "another data set: other numbers"

@@ -5,7 +5,6 @@ import json
 import os
 import pathlib
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -176,23 +175,6 @@ def test_what_cannot_be_there_is_refused_in_one_line(
         assert capsys.readouterr().err == f"error: {said}\n"
 
 
-KILLED = """
-import os, signal, sys
-from dipn_jax.datagen import cli
-from dipn_jax.commands import console
-from dipn_jax.storage.objects import Bucket
-create, made = Bucket.create, []
-def creating(self, name, data):
-    if name.startswith("shard") and len(made) == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    made.extend([name] * name.startswith("shard"))
-    return create(self, name, data)
-Bucket.create = creating
-sys.exit(console.run("test", cli.COMMANDS, sys.argv[1:]))
-"""
-"""A writer that is killed before it would create its third shard."""
-
-
 @pytest.mark.slow
 def test_racing_writers_make_each_shard_once_and_a_killed_ones_work_goes_on(
     alone: pathlib.Path, monkeypatch: pytest.MonkeyPatch
@@ -201,8 +183,7 @@ def test_racing_writers_make_each_shard_once_and_a_killed_ones_work_goes_on(
 
     with s3_server.running(monkeypatch):
         words = [*WORDS, "--out", "s3://bucket/data"]
-        killed = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True)
-        assert killed.returncode == -signal.SIGKILL, killed.stderr
+        s3_server.kill_at_third_shard(words)
         kept = {name for name in s3_server.contents("data") if name.startswith("shard")}
         assert len(kept) == 2 and "manifest.json" not in s3_server.contents("data")
         command = [sys.executable, "-m", "dipn_jax.datagen.cli", *words]

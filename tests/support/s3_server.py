@@ -4,10 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
+
+KILLED = """
+import os, signal, sys, threading
+from dipn_jax.datagen import cli
+from dipn_jax.commands import console
+from dipn_jax.storage.objects import Bucket
+create, made, turn = Bucket.create, [], threading.Lock()
+def creating(self, name, data):
+    with turn:
+        if name.startswith("shard") and len(made) == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        made.extend([name] * name.startswith("shard"))
+        return create(self, name, data)
+Bucket.create = creating
+sys.exit(console.run("test", cli.COMMANDS, sys.argv[1:]))
+"""
+"""`dipn-datagen`, killed before it would create its third shard."""
 
 
 @contextlib.contextmanager
@@ -60,3 +80,9 @@ def contents(folder: str) -> dict[str, bytes]:
     """Return the objects of a folder of the bucket."""
     keys = [one["Key"] for one in client().list_objects_v2(Bucket="bucket", Prefix=f"{folder}/").get("Contents", [])]
     return {key.rpartition("/")[2]: client().get_object(Bucket="bucket", Key=key)["Body"].read() for key in keys}
+
+
+def kill_at_third_shard(words: Sequence[str]) -> None:
+    """Run `dipn-datagen` with `words` and kill it by SIGKILL before it creates its third shard in a bucket."""
+    killed = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
