@@ -14,8 +14,9 @@ import shutil
 import sys
 from collections.abc import Sequence
 
+from dipn_jax.names import ALL_AIDS
 from dipn_jax.system import files
-from experiments import clearing_tables, command, grasping, pages
+from experiments import clearing_numbers, clearing_tables, command, grasping, pages
 from experiments.kept_results import Kept
 from experiments.runs import Part, Recipe, Run
 
@@ -164,8 +165,8 @@ def _details(run: Recipe) -> None:
         run(f"masks/{on}/true", clear, which, BUILTIN, "--masks true --label true-masks")
     for name, options in NOISE.items():
         run(f"noise/{name}", clear, heldout, BUILTIN, options, f"--label {name}")
-    for aid in clearing_tables.ABLATED:
-        others = " ".join(other for other in clearing_tables.ABLATED if other != aid)
+    for aid in ALL_AIDS:
+        others = " ".join(other for other in ALL_AIDS if other != aid)
         run(f"aids/without/{aid}", clear, heldout, BUILTIN, f"--aids {others} --label without-{aid}")
         run(f"aids/alone/{aid}", clear, heldout, BUILTIN, f"--aids {aid} --label only-{aid}")
     for name, options in CHANGED.items():
@@ -178,7 +179,7 @@ def _details(run: Recipe) -> None:
 def write_page(root: pathlib.Path, *, docs: pathlib.Path = pages.DOCS) -> None:
     """Write the tables of clearing.md, clearing.json and the figure of the sweep to `docs`, from what is kept."""
     listed, results = list_runs(root), Kept(docs / KEPT.name)
-    values = clearing_tables.numbers(listed, results)
+    values = clearing_numbers.numbers(listed, results)
     section = clearing_tables.section(values)
     values[pages.MADE] = results.made(listed)
     folder = root / "clear" / "sweep"

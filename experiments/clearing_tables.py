@@ -1,29 +1,17 @@
-"""The numbers and tables of docs/clearing.md, from results that are kept table by table."""
+"""The tables of docs/clearing.md, from the numbers of `clearing_numbers`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import textwrap
 from typing import Any, get_args
 
-import numpy as np
-from dipn_jax.eval import metrics
-from dipn_jax.eval.clearing import lockstep, sweeping
+from dipn_jax.eval.clearing import sweeping
 from dipn_jax.eval.report import paper
 
 from dipn_jax.commands import markdown
 from dipn_jax.names import ALL_AIDS, MethodName
-from experiments import runs
-from experiments.kept_results import Kept
-from experiments.runs import Run
+from experiments.clearing_numbers import PUSH_OR_NOT
 
-Trainings = dict[str, list[lockstep.Outcome]]
-"""Tables that the trainings of one method cleared, by the seed of the training."""
-ABLATED = ALL_AIDS
-"""Aids that are left out, and left alone, one after the other."""
-OURS = "dipn+gn"
-"""The method that the others are compared with."""
-MEASURES = (*paper.COLUMNS[:1], "grasps_that_held", "grasp_success_all", "efficiency_all")
-"""Measures of the tables."""
 TITLES = {
     "completion": "completion",
     "grasps_that_held": "grasps that held",
@@ -31,96 +19,8 @@ TITLES = {
     "efficiency_all": "objects per action",
 }
 """Titles of the measures."""
-
-
-def numbers(listed: Sequence[Run], kept: Kept) -> dict[str, Any]:
-    """Return all numbers of the page by name; those of runs that are not kept are not there.
-
-    Of several trainings of one method there are the ratio over all their tables, `_spread` (the largest less the
-    smallest ratio), and the interval for these trainings, over cases, then over their tables; `_less` is the difference
-    from DIPN+GN on the same tables, of the trainings of the same seed.
-    """
-    groups: dict[str, Trainings] = {}
-    for run, key in zip(listed, runs.keys(listed).values(), strict=True):
-        tables = kept.tables(run, key)
-        if tables is not None:
-            groups.setdefault(_group(run.name), {})[run.name.rpartition("/")[2]] = tables
-    groups |= _hindsight(groups)
-    values: dict[str, Any] = {}
-    for name, trainings in groups.items():
-        values |= {f"{name}/{key}": value for key, value in _measured(trainings).items()}
-        ours = groups.get(_rival(name))
-        if ours and ours is not trainings:
-            values |= {f"{name}/{key}": value for key, value in _compared(trainings, ours).items()}
-    return values
-
-
-def _hindsight(groups: dict[str, Trainings]) -> dict[str, Trainings]:
-    """Return, for the hard kinds of tables, the better of the outcomes with and without pushes, chosen table by table.
-
-    The better one has removed more; of two that have removed as much, the one with fewer actions. So nobody can choose:
-    it says how much a rule that knows when to push could win at most, with these networks.
-    """
-    found: dict[str, Trainings] = {}
-    for on in ("heldout", "hard"):
-        both = [groups.get(f"table/{on}/shipped/all/{method}") for method in PUSH_OR_NOT]
-        if both[0] and both[1]:
-            pairs = zip(*(one["0"] for one in both if one), strict=True)
-            better = [max(pair, key=lambda one: (one.removed, -one.grasps - one.pushes)) for pair in pairs]
-            found[f"hindsight/{on}"] = {"0": better}
-    return found
-
-
-def _group(name: str) -> str:
-    """Return the name of a run without the number of its training."""
-    return name.rpartition("/")[0] if name.startswith("table/") else name
-
-
-def _rival(name: str) -> str:
-    """Return the group that a group is compared with: DIPN+GN on the same tables, as it is shipped."""
-    if name.startswith("table/"):
-        return f"{name.rpartition('/')[0]}/{OURS}"
-    if name.startswith(("masks/", "hindsight/")):
-        return f"table/{name.split('/')[1]}/shipped/all/{OURS}"
-    if name.startswith("changed/"):
-        return f"{name.rpartition('/')[0]}/{OURS}"
-    return f"table/heldout/shipped/all/{OURS}"
-
-
-def _measured(trainings: Trainings) -> dict[str, Any]:
-    every = [table for tables in trainings.values() for table in tables]
-    values: dict[str, Any] = {"tables": len(every), "trainings": len(trainings)}
-    values["grasps"], values["pushes"] = (sum(getattr(one, kind) for one in every) for kind in ("grasps", "pushes"))
-    cases = [table.name for table in every]
-    each = [lockstep.counts(tables) for tables in trainings.values()]
-    for key, (hits, trials) in lockstep.counts(every).items():
-        value, low, high = metrics.ratio_interval(hits, trials, groups=cases)
-        values |= {key: value, f"{key}_low": low, f"{key}_high": high}
-        ratios = [one[key][0].sum() / max(one[key][1].sum(), 1) for one in each]
-        values[f"{key}_spread"] = float(np.ptp(ratios))
-    for reason in ("pushed out", "out of actions", "fault"):
-        values[f"ended_{reason.replace(' ', '_')}"] = sum(table.ended == reason for table in every)
-    return {
-        key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in values.items()
-    }
-
-
-def _compared(theirs: Trainings, ours: Trainings) -> dict[str, Any]:
-    """Return differences from DIPN+GN, paired by the seed of the training and by table; empty if no seed is in both."""
-    both = [seed for seed in theirs if seed in ours] if len(theirs) > 1 or len(ours) > 1 else None
-    sets = [(theirs[seed], ours[seed]) for seed in both] if both is not None else [(*theirs.values(), *ours.values())]
-    if not sets:
-        return {}
-    pairs = [pair for one, other in sets for pair in zip(one, other, strict=True)]
-    if any(a.name != b.name for a, b in pairs):
-        raise ValueError("tables of other cases, or in another order, cannot be compared")
-    cases = [a.name for a, _ in pairs]
-    sides = [lockstep.counts([pair[i] for pair in pairs]) for i in range(2)]
-    values: dict[str, Any] = {}
-    for key in MEASURES:
-        value, low, high = metrics.ratio_difference(sides[0][key], sides[1][key], cases)
-        values |= {f"{key}_less": value, f"{key}_less_low": low, f"{key}_less_high": high}
-    return values
+DIFFERENCES = {"difference": "objects per action, more than DIPN+GN", "over_gn": "more than GN alone"}
+"""Titles of the differences of a table, in percentage points."""
 
 
 def _cell(values: dict[str, Any], at: str) -> str:
@@ -134,11 +34,25 @@ def _cell(values: dict[str, Any], at: str) -> str:
 
 
 def _difference(values: dict[str, Any], at: str) -> str:
-    if values.get(f"{at}_less") is None:
+    """Return a difference in percentage points with its interval, bold where that excludes zero; empty if unknown."""
+    if values.get(at) is None:
         return ""
-    value, low, high = (100 * values[f"{at}_less{end}"] for end in ("", "_low", "_high"))
+    value, low, high = (100 * values[f"{at}{end}"] for end in ("", "_low", "_high"))
     sure = "**" if low > 0 or high < 0 else ""
+    value, low, high = (round(number, 1) + 0.0 for number in (value, low, high))  # no -0.0
     return f"{sure}{value:+.1f}{sure} [{low:+.1f}, {high:+.1f}]"
+
+
+def multiplicity(values: dict[str, Any]) -> str:
+    """Return a sentence with the number of differences on the page, and of those whose interval excludes zero."""
+    ends = [f"efficiency_all_{end}" for end in ("difference", "over_gn")]
+    shown = [key for key in values if key.endswith(tuple(ends))]
+    sure = sum(values[f"{key}_low"] > 0 or values[f"{key}_high"] < 0 for key in shown)
+    said = (
+        f"The tables below show {len(shown)} differences, each with an interval of its own; {sure} of these exclude "
+        f"zero (bold), and about {max(1, round(len(shown) / 20))} would by chance if no method differed from another."
+    )
+    return textwrap.fill(said, 120, break_on_hyphens=False)
 
 
 def _table(values: dict[str, Any], head: str, rows: dict[str, str]) -> str:
@@ -148,12 +62,11 @@ def _table(values: dict[str, Any], head: str, rows: dict[str, str]) -> str:
         if f"{at}/tables" in values:
             cells = [str(values[f"{at}/tables"]), str(values[f"{at}/pushes"])]
             cells += [_cell(values, f"{at}/{key}") for key in TITLES]
-            lines.append([title, *cells, _difference(values, f"{at}/efficiency_all")])
-    return markdown.table([head, "tables", "pushes", *TITLES.values(), "objects per action, difference"], lines)
-
-
-PUSH_OR_NOT = ("gn", "dipn+gn+actions")
-"""Methods of which the better one is chosen in hindsight."""
+            lines.append([title, *cells, *(_difference(values, f"{at}/efficiency_all_{end}") for end in DIFFERENCES)])
+    used = [column for column in range(len(DIFFERENCES)) if any(line[6 + column + 1] for line in lines)]
+    titles = [title for column, title in enumerate(DIFFERENCES.values()) if column in used]
+    lines = [[*line[:7], *(line[7 + column] for column in used)] for line in lines]
+    return markdown.table([head, "tables", "pushes", *TITLES.values(), *titles], lines)
 
 
 def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
@@ -170,6 +83,8 @@ def of_methods(values: dict[str, Any], on: str, aids: str) -> str:
         return ""
     if aids == "all":
         rows[f"hindsight/{on}"] = f"the better of {' and '.join(PUSH_OR_NOT)}, in hindsight"
+        if on == "heldout":
+            rows["hindsight/luck"] = "the better of dipn+gn and itself with 2 mm of noise, in hindsight"
     text = _table(values, f"{on}, {'all aids' if aids == 'all' else 'bare'}", rows)
     for method, published in paper.TABLE.get(on, {}).items() if aids == "bare" else ():
         found = dict(zip(paper.COLUMNS, published, strict=True))
@@ -185,7 +100,7 @@ def _trainings(values: dict[str, Any], at: str) -> str:
 
 
 SECTIONS = {
-    "heldout": "Held-out hard tables: nothing was chosen by them",
+    "heldout": "Held-out hard tables: no constant was chosen by them",
     "hard": "The ten hard tables of the paper, by which aids and constants were chosen",
     "random-10": "10 objects, dropped at random",
     "random-30": "30 objects, dropped at random",
@@ -204,7 +119,7 @@ def section(values: dict[str, Any]) -> str:
             masks |= {shipped.format(on): f"{on}, found in the image", f"masks/{on}/true": f"{on}, the simulator's"}
     base = {shipped.format("heldout"): "as it is"}
     aids: dict[str, str] = {}
-    for aid in ABLATED:
+    for aid in ALL_AIDS:
         aids |= {f"aids/without/{aid}": f"all but `{aid}`", f"aids/alone/{aid}": f"`{aid}` alone"}
     distance = {"distance/chosen": "3 to 12 cm, chosen for each push"}
     others: tuple[tuple[str, str, dict[str, str], dict[str, str]], ...] = (
@@ -222,7 +137,7 @@ def section(values: dict[str, Any]) -> str:
     for title, head, first, rows in others:
         there = {at: name for at, name in rows.items() if f"{at}/tables" in values}
         parts[title] = _table(values, head, first | there) if there else ""
-    return "\n" + "".join(f"## {title}\n\n{text}\n" for title, text in parts.items() if text)
+    return f"\n{multiplicity(values)}\n\n" + "".join(f"## {title}\n\n{text}\n" for title, text in parts.items() if text)
 
 
 def _named(values: dict[str, Any], kind: str) -> dict[str, str]:

@@ -8,7 +8,7 @@ from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import lockstep
 
 from dipn_jax.system import files
-from experiments import clearing_tables, kept_results, runs
+from experiments import clearing_numbers, clearing_tables, kept_results, runs
 from experiments.kept_results import Kept
 from experiments.runs import Recipe, Run
 
@@ -78,8 +78,10 @@ def test_trainings_are_paired_by_their_seed(tmp_path: pathlib.Path) -> None:
         "table/hard/paper/all/gn/0": [50, 50],
         "table/hard/paper/all/gn/1": [5, 5],
     }
-    values = clearing_tables.numbers(*_kept(tmp_path, rows))
-    assert values["table/hard/paper/all/gn/efficiency_all_less"] == 0, "the first training was compared with the second"
+    values = clearing_numbers.numbers(*_kept(tmp_path, rows))
+    assert values["table/hard/paper/all/gn/efficiency_all_difference"] == 0, (
+        "the first training was compared with the second"
+    )
 
 
 def test_numbers_of_several_trainings_and_differences(tmp_path: pathlib.Path) -> None:
@@ -89,24 +91,24 @@ def test_numbers_of_several_trainings_and_differences(tmp_path: pathlib.Path) ->
         "table/hard/paper/all/gn/0": [10, 10, 20, 20],
         "table/hard/paper/all/gn/1": [10, 10, 10, 10],
     }
-    values = clearing_tables.numbers(*_kept(tmp_path, rows))
+    values = clearing_numbers.numbers(*_kept(tmp_path, rows))
     at = "table/hard/paper/all/dipn+gn"
     assert values[f"{at}/tables"] == 8 and values[f"{at}/trainings"] == 2 and values[f"{at}/grasps"] == 50
     assert values[f"{at}/efficiency_all"] == 40 / 50
     assert values[f"{at}/efficiency_all_spread"] == pytest.approx(20 / 20 - 20 / 30)
-    hits, trials = [5] * 8, [5, 5, 10, 10, 5, 5, 5, 5]
-    want = metrics.ratio_interval(hits, trials, groups=["a", "a", "b", "b"] * 2)
+    hits, trials = [10] * 4, [10, 10, 15, 15]  # of a table in both trainings: it is no other table in the second
+    want = metrics.ratio_interval(hits, trials, groups=["a", "a", "b", "b"])
     assert (values[f"{at}/efficiency_all_low"], values[f"{at}/efficiency_all_high"]) == want[1:]
     other = "table/hard/paper/all/gn"
-    assert values[f"{other}/efficiency_all_less"] == pytest.approx(40 / 100 - 40 / 50)
-    assert values[f"{other}/efficiency_all_less_high"] < 0 and f"{at}/efficiency_all_less" not in values
+    assert values[f"{other}/efficiency_all_difference"] == pytest.approx(40 / 100 - 40 / 50)
+    assert values[f"{other}/efficiency_all_difference_high"] < 0 and f"{at}/efficiency_all_difference" not in values
     text = clearing_tables.of_methods(values, "hard", "all")
-    assert "| dipn+gn, paper (2 trainings) | 8 | 0 | 100.0 [100, 100] (0.0) |" in text and "| **-40.0** [" in text
+    assert "| dipn+gn, paper (2 trainings) | 8 | 0 | 100.0 [16, 100] (0.0) |" in text and "| **-40.0** [" in text
 
 
 def test_a_difference_that_may_be_nothing_is_not_bold(tmp_path: pathlib.Path) -> None:
     rows = {"table/hard/paper/all/dipn+gn/0": [5, 9, 5, 9], "table/hard/paper/all/gn/0": [9, 5, 9, 5]}
-    text = clearing_tables.of_methods(clearing_tables.numbers(*_kept(tmp_path, rows)), "hard", "all")
+    text = clearing_tables.of_methods(clearing_numbers.numbers(*_kept(tmp_path, rows)), "hard", "all")
     assert "+0.0 [" in text and "**" not in text and "| gn, paper (1 training) |" in text
 
 
@@ -118,10 +120,10 @@ def test_changed_worlds_are_compared_with_the_same_networks_in_the_same_world(tm
         "changed/heavy/paper/dipn+gn": [20, 20, 20, 20],
         "changed/heavy/paper/dqn+gn": [10, 10, 10, 10],
     }
-    values = clearing_tables.numbers(*_kept(tmp_path, rows))
+    values = clearing_numbers.numbers(*_kept(tmp_path, rows))
     text = clearing_tables.section(values)
-    assert values["changed/heavy/gn/efficiency_all_less"] == 0.5 - 1
-    assert values["changed/heavy/paper/dqn+gn/efficiency_all_less"] == 0.5 - 0.25
+    assert values["changed/heavy/gn/efficiency_all_difference"] == 0.5 - 1
+    assert values["changed/heavy/paper/dqn+gn/efficiency_all_difference"] == 0.5 - 0.25
     titles = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| ")]
     assert titles[2:] == [
         "heavy: dipn+gn, shipped",
@@ -140,24 +142,47 @@ def test_hindsight_chooses_the_better_table_by_table(tmp_path: pathlib.Path) -> 
     }
     listed, results = _kept(tmp_path, rows)
     results.found["table/hard/shipped/all/gn/0"]["rows"][3][3] -= 1  # fewer actions, but an object is left
-    values = clearing_tables.numbers(listed, results)
+    values = clearing_numbers.numbers(listed, results)
     assert values["hindsight/hard/grasps"] == 5 + 5 + 6 + 7
-    assert values["hindsight/hard/efficiency_all_less"] == pytest.approx(20 / 23 - 1)
+    assert values["hindsight/hard/efficiency_all"] == pytest.approx(20 / 23)
+    assert not any("hindsight" in key and ("difference" in key or "over_gn" in key) for key in values), "it is chosen"
     assert "| the better of gn and dipn+gn+actions, in hindsight | 4 |" in clearing_tables.of_methods(
         values, "hard", "all"
     )
     del results.found["table/hard/shipped/all/gn/0"]
-    assert "hindsight" not in "".join(clearing_tables.numbers(listed, results))
+    assert "hindsight" not in "".join(clearing_numbers.numbers(listed, results))
 
 
 def test_every_group_is_compared_with_dipn_gn_on_its_own_tables() -> None:
     rivals = {
         "table/hard/paper/bare/vpg": "table/hard/paper/bare/dipn+gn",
         "masks/random-10/true": "table/random-10/shipped/all/dipn+gn",
-        "hindsight/random-10": "table/random-10/shipped/all/dipn+gn",
         "changed/heavy/gn": "changed/heavy/dipn+gn",
         "noise/holes": "table/heldout/shipped/all/dipn+gn",
         "aids/alone/table": "table/heldout/shipped/all/dipn+gn",
     }
     for name, rival in rivals.items():
-        assert clearing_tables._rival(name) == rival
+        assert clearing_numbers._rival(name, "dipn+gn") == rival
+
+
+def test_methods_with_pushes_are_compared_with_grasping_alone_too(tmp_path: pathlib.Path) -> None:
+    rows = {
+        "table/hard/paper/all/dipn+gn/0": [5, 5, 10, 10],
+        "table/hard/paper/all/gn/0": [10, 10, 10, 10],
+        "table/hard/paper/all/vpg/0": [20, 20, 20, 20],
+    }
+    values = clearing_numbers.numbers(*_kept(tmp_path, rows))
+    assert values["table/hard/paper/all/gn/efficiency_all_difference"] == pytest.approx(20 / 40 - 20 / 30)
+    assert "table/hard/paper/all/dipn+gn/efficiency_all_over_gn" not in values, "the same with the other sign"
+    assert values["table/hard/paper/all/vpg/efficiency_all_over_gn"] == 20 / 80 - 20 / 40
+    assert "table/hard/paper/all/gn/efficiency_all_over_gn" not in values
+    text = clearing_tables.of_methods(values, "hard", "all")
+    assert "| more than GN alone |" in text.splitlines()[0] and "| **-25.0** [-25.0, -25.0] |" in text
+    assert "show 3 differences, each with an interval of its own; 2 of these" in clearing_tables.multiplicity(values)
+
+
+def test_luck_is_the_better_of_a_method_and_itself(tmp_path: pathlib.Path) -> None:
+    rows = {"table/heldout/shipped/all/dipn+gn/0": [5, 9, 6, 7], "noise/height-2mm": [8, 5, 6, 5]}
+    values = clearing_numbers.numbers(*_kept(tmp_path, rows))
+    assert values["hindsight/luck/grasps"] == 5 + 5 + 6 + 5 and "hindsight/heldout/grasps" not in values
+    assert "itself with 2 mm of noise, in hindsight | 4 |" in clearing_tables.of_methods(values, "heldout", "all")
