@@ -18,7 +18,7 @@ from benchmarks.datagen_mjx import heaps
 from benchmarks.gpu_stage import COMPILING, Found, NotMeasured, Size, installed
 from benchmarks.harness import make_data, seconds
 from dipn_jax import batching, structs
-from dipn_jax.engine import Engine
+from dipn_jax.engine import DeviceEngine, Engine
 from dipn_jax.names import EngineName
 from dipn_jax.physics import cores, make_engine, mjx, warp
 from dipn_jax.physics.mjx import MjxEngine
@@ -54,12 +54,17 @@ class Padded:
         fence: float = 0.0,
     ) -> Rollout:
         """See `Engine.simulate`."""
-        count = len(np.asarray(poses))
+        count = len(poses)
         room = self.small if count <= self.small else -(-count // self.full) * self.full
         rows = np.arange(room) % count
-        scenes, poses, trajectories = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (scenes, poses, trajectories))
+        scenes, poses, trajectories = jax.tree.map(lambda leaf: leaf[rows], (scenes, poses, trajectories))
         out = self.engine.simulate(scenes, poses, trajectories, samples, settle=settle, fence=fence)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], out)
+        return jax.tree.map(lambda leaf: leaf[:count], out)
+
+    def on_device(self) -> Engine | None:
+        """See `DeviceEngine.on_device`."""
+        queued = self.engine.on_device() if isinstance(self.engine, DeviceEngine) else None
+        return Padded(queued, small=self.small, full=self.full) if queued else None
 
     def stop(self) -> None:
         """See `Engine.stop`."""

@@ -65,7 +65,7 @@ def push_batch(
     poses = np.array(rollout.poses)
     poses[:, 0] = repeated.poses  # where the simulation began; as the gripper arrives, they are a few micrometres off
     episodes = PushEpisode(repeated.scene, poses[:, : PUSH_STEPS + 1], poses[:, -1], pushes, np.asarray(rollout.fault))
-    return _drop_unusable(episodes, counts, together=len(distances))
+    return drop_unusable(episodes, counts, together=len(distances))
 
 
 def aim_pushes(keys: jax.Array, scene: Scene, poses: Array, *, actions: int) -> tuple[Push, jax.Array]:
@@ -83,7 +83,7 @@ def _aim_pushes(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
         seen = render.render(*args[1:])
         return candidates.sample_pushes(args[0], seen, count=actions, distance=PUSH_STEPS * 0.01)
 
-    return jax.lax.map(one, (keys, scene, poses))
+    return batching.each_row(one, (keys, scene, poses))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +124,7 @@ def grasp_batch(
         success=np.asarray(outcome.success),
         fault=np.asarray(rollout.fault),
     )
-    return _drop_unusable(episodes, counts)
+    return drop_unusable(episodes, counts)
 
 
 def aim_grasps(keys: jax.Array, scene: Scene, poses: Array, *, actions: int, guide: Guide | None = None) -> Grasp:
@@ -141,7 +141,7 @@ def _aim_grasps(keys: jax.Array, scene: Scene, poses: jax.Array, *, actions: int
         scores = guide.scorer(render.rgbd(seen)[None])[0]
         return candidates.sample_grasps(args[0], seen, scores, count=actions, guided=guide.guided, unsure=guide.unsure)
 
-    return jax.lax.map(one, (keys, scene, poses))
+    return batching.each_row(one, (keys, scene, poses))
 
 
 def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, count: int) -> Batch:
@@ -150,7 +150,7 @@ def image_batch(key: jax.Array, engine: Engine, config: scenes.SceneConfig, *, c
     return Batch(items if len(items.fault) else None, counts)
 
 
-def _drop_unusable(episodes: Any, counts: dict[str, int], *, together: int = 1) -> Batch:
+def drop_unusable(episodes: Any, counts: dict[str, int], *, together: int = 1) -> Batch:
     """Return the usable episodes; where one of `together` neighbours is faulty, all of them are left out."""
     fault = episodes.fault
     counts.update({f"action_{name}": n for name, n in Fault.count(fault).items()})

@@ -21,7 +21,7 @@ import jax
 
 from dipn_jax import seeds, structs
 from dipn_jax.commands import console
-from dipn_jax.engine import Engine
+from dipn_jax.engine import DeviceEngine, Engine
 from dipn_jax.errors import UserError
 from dipn_jax.names import EngineName
 from dipn_jax.physics import make_engine, resolve
@@ -33,7 +33,7 @@ from dipn_jax.system import files, typed
 from dipn_jax.workspace import PUSH_STEPS
 from dipn_jax.world.scenes import SceneConfig
 
-from . import episodes
+from . import episodes, on_device
 
 PURPOSES = {"push": Purpose.PUSH_DATA, "grasp": Purpose.GRASP_DATA, "images": Purpose.IMAGE_DATA}
 """The purpose of the random numbers of each kind of data."""
@@ -118,15 +118,17 @@ class _Tally:
             self.progress.advance(fresh, f"{self.counts['dropped_scenes']} scenes dropped; {said}")
 
 
-def _maker(job: Job, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
-    """Return the function that makes a batch of episodes of `job`: (key, engine, scenes, *, count)."""
+def _maker(job: Job, engine: Engine, scorer: Scorer | None) -> Callable[..., episodes.Batch]:
+    """Return the function that makes a batch of episodes of `job` with `engine`: (key, *, count)."""
     guide = episodes.Guide(scorer, job.guided, job.unsure) if scorer else None
+    queued = engine.on_device() if isinstance(engine, DeviceEngine) and job.kind != "images" else None
+    rooms = on_device if queued else episodes
     makers: dict[str, Callable[..., episodes.Batch]] = {
-        "push": functools.partial(episodes.push_batch, actions=job.actions, distances=job.distances),
-        "grasp": functools.partial(episodes.grasp_batch, actions=job.actions, guide=guide),
+        "push": functools.partial(rooms.push_batch, actions=job.actions, distances=job.distances),
+        "grasp": functools.partial(rooms.grasp_batch, actions=job.actions, guide=guide),
         "images": episodes.image_batch,
     }
-    return makers[job.kind]
+    return functools.partial(makers[job.kind], engine=queued or engine, config=job.scene)
 
 
 def shard(
@@ -135,7 +137,7 @@ def shard(
     """Return the episodes of one shard and the counts of the batches that they are from."""
     want = job.size(index)
     key = jax.random.fold_in(seeds.key(job.seed, PURPOSES[job.kind]), index)
-    make = _maker(job, scorer)
+    make = _maker(job, engine, scorer)
     each = job.actions * (len(job.distances) if job.kind == "push" else 1)
     done: list[Any] = []
     counts: collections.Counter[str] = collections.Counter()
@@ -144,7 +146,7 @@ def shard(
         key, batch_key = jax.random.split(key)
         # a tenth more than needed, for scenes that are dropped
         count = min(engine.batch, int(1.1 * (want - have) / each) + 1)
-        batch = make(batch_key, engine, job.scene, count=count)
+        batch = make(batch_key, count=count)
         counts.update(batch.counts)
         empty = empty + 1 if batch.episodes is None else 0
         if empty == MAX_ATTEMPTS:

@@ -43,6 +43,16 @@ def in_batches(function: Callable[..., Any], *args: Any) -> Any:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
 
 
+def each_row(function: Callable[..., Any], rows: Any) -> Any:
+    """Return `function` of each row, traced: one after another on a CPU, SMALL_BATCH at a time on an accelerator.
+
+    Args:
+      function: of a row of `rows`.
+      rows: pytree with a leading axis.
+    """
+    return jax.lax.map(function, rows, batch_size=None if jax.default_backend() == "cpu" else SMALL_BATCH)
+
+
 def in_small_batches(function: Callable[..., Any], *args: Any) -> Any:
     """Return `function(*args)` as `in_batches` does, always SMALL_BATCH rows at a time, for expensive rows.
 

@@ -6,7 +6,7 @@ The engines themselves are in `dipn_jax.physics`; a function that simulates take
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from jaxtyping import Float
 
@@ -78,6 +78,18 @@ class Engine(Protocol):
 
     def stop(self) -> None:
         """End `simulate`, now and in all later calls, as soon as possible; to be called from another thread."""
+        ...
+
+
+@runtime_checkable
+class DeviceEngine(Engine, Protocol):
+    """An engine that can return before its results are there."""
+
+    def on_device(self) -> Engine | None:
+        """Return this engine for arrays that stay on its device: `simulate` does not wait, and can be traced.
+
+        None if it has several devices, between which rows would travel.
+        """
         ...
 
 

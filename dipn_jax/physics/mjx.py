@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -87,10 +89,29 @@ class MjxEngine:
         fence: float = 0.0,
     ) -> Rollout:
         """See `Engine.simulate`; returns NumPy arrays."""
+        scenes, poses, trajectories = jax.tree.map(np.asarray, (scenes, poses, trajectories))
+        return self._simulate(scenes, poses, trajectories, samples, settle=settle, fence=fence, xp=np)
+
+    def on_device(self) -> OnDevice | None:
+        """See `DeviceEngine.on_device`; it shares programs, and `stop`, with this one."""
+        return OnDevice(self) if len(self.devices) == 1 else None
+
+    def _simulate(
+        self,
+        scenes: Scene,
+        poses: Array,
+        trajectories: Trajectory,
+        samples: Array,
+        *,
+        settle: bool,
+        fence: float,
+        xp: ModuleType,
+    ) -> Rollout:
+        """Simulate in chunks; with `xp` numpy the results are fetched, with jax.numpy nothing waits for them."""
         ticks = np.round(np.asarray(samples) / physics.CONTROL_PERIOD).astype(np.int32)
         padded = np.append(ticks, np.full(max(PADDED_SAMPLES - len(ticks), 0), -1, np.int32))
-        args = jax.tree.map(np.asarray, (scenes, poses, _pad(trajectories)))
-        batch, slots = args[0].shape.shape
+        args = scenes, poses, _pad(trajectories, xp)
+        batch, slots = scenes.shape.shape
         # powers of two, so that batches of many sizes share few programs
         size = max(min(1 << (batch - 1).bit_length(), self.chunk), len(self.devices))
         done: list[Rollout] = []
@@ -103,8 +124,9 @@ class MjxEngine:
                     raise Stopped
                 whole = *part, _room(size, len(padded), slots), padded, np.bool_(settle), np.float32(fence)
                 fresh = self._program(size, slots, whole)(*whole)
-                done = [*done[:-1], *jax.device_get(done[-1:]), fresh]  # fetched while the next one runs
-        out = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(x) for x in leaves])[:batch], *done)
+                last = done[-1:] if xp is jnp else jax.device_get(done[-1:])  # fetched while the next one runs
+                done = [*done[:-1], *last, fresh]
+        out = jax.tree.map(lambda *leaves: xp.concatenate([xp.asarray(x) for x in leaves])[:batch], *done)
         return Rollout(out.poses[:, : len(ticks)], out.gripper[:, : len(ticks)], out.fault)
 
     def _program(self, size: int, slots: int, arguments: tuple[Any, ...]) -> Callable[..., Rollout]:
@@ -155,14 +177,44 @@ class MjxEngine:
         self._stopped.set()
 
 
+class OnDevice:
+    """An `Engine` that returns before the result is there, as arrays on the device; it can be traced.
+
+    So what is computed from one rollout, and simulated next, waits for no copy to the host.
+    """
+
+    def __init__(self, engine: MjxEngine) -> None:
+        """Make it for `engine`, whose programs it shares."""
+        self._engine = engine
+        self.name, self.config, self.batch = engine.name, engine.config, engine.batch
+
+    def simulate(
+        self,
+        scenes: Scene,
+        poses: Float[Array, "B N 7"],
+        trajectories: Trajectory,
+        samples: Float[Array, " S"],
+        *,
+        settle: bool = False,
+        fence: float = 0.0,
+    ) -> Rollout:
+        """See `Engine.simulate`; returns arrays on the device."""
+        scenes, poses, trajectories = jax.tree.map(jnp.asarray, (scenes, poses, trajectories))
+        return self._engine._simulate(scenes, poses, trajectories, samples, settle=settle, fence=fence, xp=jnp)
+
+    def stop(self) -> None:
+        """See `Engine.stop`."""
+        self._engine.stop()
+
+
 def _room(batch: int, samples: int, slots: int) -> tuple[Array, Array]:
     """Return memory for the poses and the gripper of a record, which the result takes over."""
     return np.zeros((batch, samples, slots, 7), np.float32), np.zeros((batch, samples, 5), np.float32)
 
 
-def _pad(trajectories: Trajectory) -> Trajectory:
+def _pad(trajectories: Trajectory, xp: ModuleType) -> Trajectory:
     """Return trajectories of `PADDED_KEY_FRAMES` key frames at least: the last one repeats, a second apart."""
-    time, target = np.asarray(trajectories.time, np.float32), np.asarray(trajectories.target, np.float32)
+    time, target = xp.asarray(trajectories.time, np.float32), xp.asarray(trajectories.target, np.float32)
     more = max(PADDED_KEY_FRAMES - time.shape[1], 0)
     later = time[:, -1:] + np.arange(1, more + 1, dtype=np.float32)
-    return Trajectory(np.concatenate([time, later], 1), np.concatenate([target, *[target[:, -1:]] * more], 1))
+    return Trajectory(xp.concatenate([time, later], 1), xp.concatenate([target, *[target[:, -1:]] * more], 1))

@@ -18,7 +18,7 @@ _CODE_AT_IMPORT = files.code_digest()
 
 
 def program(
-    function: Callable[..., tuple[Array, ...]], arguments: Sequence[np.ndarray], *, what: str, donate: Sequence[int]
+    function: Callable[..., tuple[Array, ...]], arguments: Sequence[Array], *, what: str, donate: Sequence[int]
 ) -> Callable[..., tuple[Array, ...]]:
     """Return `jax.jit(function)`, with the trace that an earlier process has kept on disk if there is one.
 
@@ -32,7 +32,7 @@ def program(
       A function of the same arguments. Traces are kept in `traced` in the folder of JAX's compilation cache; without
       such a folder, or where it cannot be written, nothing is kept. A file that cannot be read is written anew.
     """
-    shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.asarray(leaf).dtype) for leaf in arguments]
+    shapes = [jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype) for leaf in arguments]
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if not cache:
         return jax.jit(function, donate_argnums=tuple(donate))

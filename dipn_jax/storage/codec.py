@@ -124,3 +124,26 @@ def rounded(struct: T, *, prefix: str = "") -> T:
     """
     named = {prefix + name: value for name, value in columns(struct).items()}
     return assemble(type(struct), decode(*encode(named)), prefix=prefix)
+
+
+STEPS = {name: np.float32(round(1 / quantum)) for name, quantum in QUANTA.items()}
+"""Quanta in a unit (a metre, a kilogram, ...) for each quantized column, which are whole numbers."""
+
+
+def rounded_on_device(struct: T, steps: dict[str, jax.Array], *, prefix: str = "") -> T:
+    """Return a batch rounded as `rounded` does, traced.
+
+    A value near the middle between two multiples of a quantum may become the other one: the product is a float32.
+
+    Args:
+      struct: a batch of scenes, poses or actions, JAX.
+      steps: STEPS, as an argument of the compiled function: XLA multiplies by the inverse of a constant divisor, which
+        is rounded, so that what is stored would not be what was simulated.
+      prefix: before the names of its columns, such as `push.` for a `Push`.
+    """
+
+    def one(path: Any, leaf: jax.Array) -> jax.Array:
+        each = steps.get(prefix + jax.tree_util.keystr(path).lstrip("."))
+        return leaf if each is None else jax.numpy.round(leaf * each) / each
+
+    return jax.tree_util.tree_map_with_path(one, struct)

@@ -33,14 +33,22 @@ def settled(
     Returns:
       The scenes kept `[K]`, and how many were dropped and why others were not kept.
     """
+    everything = drop(key, engine, config, count)
+    return structs.take(everything, np.asarray(everything.fault) == 0), drop_counts(everything.fault)
+
+
+def drop(key: Key[Array, ""], engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:
+    """Drop `count` random scenes and return them as they lie then, on the engine's side, with the faults of some."""
     forking.check()
     draw = functools.partial(_random_scenes, config=config)
-    scene, poses = jax.tree.map(np.asarray, batching.in_batches(draw, jax.random.split(key, count)))
+    scene, poses = batching.in_batches(draw, jax.random.split(key, count))
     rollout = primitives.settle(engine, scene, poses, fence=primitives.FENCE_TIME)
-    fault = np.asarray(rollout.fault)
-    everything = SettledScene(scene, np.asarray(rollout.poses)[:, -1], fault)
-    counts = {f"settle_{name}": n for name, n in Fault.count(fault).items()}
-    return structs.take(everything, fault == 0), {"dropped_scenes": count, **counts}
+    return SettledScene(scene, rollout.poses[:, -1], rollout.fault)
+
+
+def drop_counts(fault: Int[Array, " B"]) -> dict[str, int]:
+    """Return how many scenes were dropped and how many ended with each fault, from their fault codes."""
+    return {"dropped_scenes": len(fault), **{f"settle_{name}": n for name, n in Fault.count(fault).items()}}
 
 
 def settled_scenes(key: Key[Array, ""], engine: Engine, config: scenes.SceneConfig, count: int) -> SettledScene:

@@ -113,8 +113,7 @@ def settle(
 ) -> Rollout:
     """Let the scenes come to rest; one sample, at the end. For `fence` see `Engine.simulate`."""
     forking.check()
-    batch = len(np.asarray(scenes.shape))
-    still, end = parked_trajectory(batch, duration), np.array([duration])
+    still, end = parked_trajectory(len(scenes.shape), duration), np.array([duration])
     return engine.simulate(scenes, poses, still, end, settle=True, fence=fence)
 
 

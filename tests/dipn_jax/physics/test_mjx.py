@@ -230,6 +230,20 @@ def test_a_scene_does_not_depend_on_its_batch(engine: MjxEngine, settled: tuple[
     np.testing.assert_allclose(five.poses[4], four.poses[0], atol=1e-5)
 
 
+def test_on_its_device_it_returns_the_same_arrays_and_can_be_traced(
+    engine: MjxEngine, settled: tuple[Scene, np.ndarray]
+) -> None:
+    scene, poses = jax.tree.map(jnp.asarray, settled)
+    queued = engine.on_device()
+    assert queued is not None
+    found = primitives.settle(queued, scene, poses, duration=0.05)
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(found))
+    wanted = primitives.settle(engine, *settled, duration=0.05)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(found), wanted)
+    traced = jax.eval_shape(lambda at: primitives.settle(queued, scene, at, duration=0.05), poses)
+    assert traced.poses.shape == found.poses.shape
+
+
 def test_a_fence_pushes_as_in_mujoco_c(
     engine: MjxEngine, reference: NativeEngine, settled: tuple[Scene, np.ndarray]
 ) -> None:
