@@ -74,13 +74,13 @@ class Tables:
         """Make all tables, at rest."""
         from dipn_jax.world import scenes
 
-        from .instances import hard_instances, random_instances
+        from .instances import case_instances, random_instances
 
         path = self.path()
         if path is None:
             config = scenes.parse_objects(self.objects, ranges=self.ranges)
             return random_instances(engine, config, count=self.instances, seed=seed)
-        return hard_instances(
+        return case_instances(
             engine,
             path,
             list(self.names) or None,

@@ -114,14 +114,14 @@ def test_tables_are_a_case_file_or_random() -> None:
 def test_a_repeat_of_a_case_does_not_depend_on_the_number_of_repeats(engine: Any) -> None:
     path = cases.hard_cases_path()
     names, scene, poses = cases.load_cases(path, slots=6)
-    few, more = (instances.hard_instances(engine, path, names[1:3], slots=6, repeats=count, seed=0) for count in (2, 3))
+    few, more = (instances.case_instances(engine, path, names[1:3], slots=6, repeats=count, seed=0) for count in (2, 3))
     assert [each.name for each in more] == [names[1]] * 3 + [names[2]] * 3
     for here, there in zip(few, [more[0], more[1], more[3], more[4]], strict=True):
         np.testing.assert_array_equal(here.scene.mass, there.scene.mass)
         np.testing.assert_allclose(here.poses, there.poses, atol=1e-6)
     assert [table.number for table in few] == [more[i].number for i in (0, 1, 3, 4)]
     assert len({table.number for table in more}) == 6, "each has random numbers of its own"
-    placed = instances.hard_instances(engine, path, names[1:2], slots=6, repeats=1, seed=0, perturbed=False)[0]
+    placed = instances.case_instances(engine, path, names[1:2], slots=6, repeats=1, seed=0, perturbed=False)[0]
     np.testing.assert_array_equal(placed.scene.mass, scene.mass[1])
     assert (more[0].scene.mass != scene.mass[1])[scene.shape[1] >= 0].all(), "the first repeat is as it is placed"
     there = scene.shape[1] >= 0
