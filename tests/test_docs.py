@@ -16,13 +16,14 @@ import pytest
 import tyro
 from dipn_jax.datagen.exporting.export import NEEDS
 from dipn_jax.eval.report import paper
+from dipn_jax.train import cli
 
 from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
 from dipn_jax.commands import console
 from dipn_jax.sight import render
 from dipn_jax.system import files
-from experiments import moving_picture, runs, tutorial_pictures
+from experiments import moving_picture, push_prediction, runs, tutorial_pictures
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -148,6 +149,17 @@ def test_the_readme_fits_on_a_screen_and_its_table_is_the_kept_one() -> None:
     published = dict(zip(paper.COLUMNS, paper.TABLE["hard"]["dipn+gn"], strict=True))
     said = "{completion:.1f}, {grasp_success_all:.1f} and {efficiency_all:.1f}".format(**published)
     assert f"for DIPN + GN on the hard tables {said}" in " ".join(text.split())
+
+
+def test_the_steps_that_a_page_recommends_are_those_of_the_learning_curves() -> None:
+    text = (ROOT / "docs" / "howto" / "your_network.md").read_text()
+    rows = re.findall(r"^\| ([\d,]+) \| ([\d,]+) \| ([\d.]+) \|$", text, re.MULTILINE)
+    table = {int(pushes.replace(",", "")): int(steps.replace(",", "")) for pushes, steps, _ in rows}
+    assert table == push_prediction.STEPS
+    for (pushes, steps), (*_, said) in zip(table.items(), rows, strict=True):
+        passes = steps * cli.PUSH.batch / pushes
+        assert said == (f"{passes:.0f}" if passes > 10 else f"{passes:.1f}")
+    assert f"{cli.PUSH.steps:,} steps, is {cli.PUSH.steps * cli.PUSH.batch / 1350:.0f} passes over the 1,350 " in text
 
 
 def test_the_changelog_is_short() -> None:
