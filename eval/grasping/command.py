@@ -42,7 +42,7 @@ def grasp(
 
     Success against grasps learnt from, with a band over seeds (curve.png, and in metrics.json
     online/{with,without}/GRASPS/...):
-      dipn-eval grasp --curve runs/online/* --out results/curve
+      dipn-eval grasp --curve runs/online/*/ --out results/curve
 
     Args:
       out: folder for metrics.json, pictures and every step of every table.

@@ -40,7 +40,7 @@ def predict(
 
     Error against number of pushes, with a band over seeds (curve-all.png, curve-all.md, and in
     metrics.json push_error/curve/PUSHES/...):
-      dipn-eval prediction --curve runs/curve/* --scenes 1000 --out results/curve
+      dipn-eval prediction --curve runs/curve/*/ --scenes 1000 --out results/curve
 
     Args:
       out: folder for metrics.json and pictures.
