@@ -70,6 +70,15 @@ class Tables:
             return scenes.parse_objects(self.objects, ranges=self.ranges).slots
         return int(case_files.load_cases(path)[1].shape.shape[1])
 
+    def count(self) -> int:
+        """Return the number of tables; nothing is simulated."""
+        from dipn_jax.world import cases as case_files
+
+        path = self.path()
+        if path is None:
+            return self.instances
+        return self.instances * len(self.names or case_files.load_cases(path)[0])
+
     def make(self, engine: Engine, *, seed: int) -> list[Instance]:
         """Make all tables, at rest."""
         from dipn_jax.world import scenes

@@ -90,7 +90,7 @@ def grasp(
         physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
         scorer = scorers.load_scorer(run, aids=aids)
     if launch.uses_cluster:
-        launching.evaluate("grasp", asked, partial)
+        launching.evaluate("grasp", asked, partial, total=scenes_)
         return
     with owner.owned(out):
         if shares.is_made(out, "grasp", share, partial):
