@@ -162,6 +162,18 @@ def test_the_steps_that_a_page_recommends_are_those_of_the_learning_curves() -> 
     assert f"{cli.PUSH.steps:,} steps, is {cli.PUSH.steps * cli.PUSH.batch / 1350:.0f} passes over the 1,350 " in text
 
 
+def test_the_rates_by_which_a_page_compares_engines_on_a_gpu_are_those_that_were_measured() -> None:
+    text = " ".join((ROOT / "docs" / "howto" / "engines.md").read_text().split())
+    rates = files.read_json(ROOT / "docs" / "benchmarks-h200.json")["figures"]
+    native, mjx, warp = (
+        round(max(rate for name, rate in rates.items() if name.startswith(f"engines.scene_seconds/{engine}/")))
+        for engine in ("native", "mjx", "warp")
+    )
+    assert f"by {native} scene seconds a second under `native` on 16 cores, and by {mjx} under `mjx`" in text
+    assert f"under `warp`, as it was at commit 4c8f9f8, by {warp}," in text
+    assert "2.3 h, and the host's 16 cores 1.2 h" in (ROOT / "docs" / "scaling.md").read_text()
+
+
 def test_the_changelog_is_short() -> None:
     versions = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1:]
     for version in versions:
