@@ -34,7 +34,16 @@ FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(dipn-(?:datagen|train|eval) [^`]+)`")
 OPTION = re.compile(r"`(--[a-z][a-z0-9_-]*)[^`]*`")
 """An option that stands in a sentence without its command."""
-FOREIGN = {"--cpus-per-task", "--dependency", "--gpus-per-task", "--requeue", "--xla_gpu_enable_command_buffer"}
+FOREIGN = {
+    "--array",
+    "--constraint",
+    "--cpus-per-task",
+    "--dependency",
+    "--export",
+    "--gpus-per-task",
+    "--requeue",
+    "--xla_gpu_enable_command_buffer",
+}
 """Options of other programs, of which pages speak."""
 OURS = {"--dry-run", "--minutes", "--list", "--only", "--page", "--scale", "--toy", "--out", "--seed"}
 """Options of experiments and benchmarks."""
