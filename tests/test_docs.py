@@ -10,6 +10,7 @@ import re
 import shutil
 from collections.abc import Callable
 
+import jax
 import numpy as np
 import page_commands
 import pytest
@@ -21,6 +22,8 @@ from dipn_jax.train import cli
 from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
 from dipn_jax.commands import console
+from dipn_jax.planning import methods
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.sight import render
 from dipn_jax.system import files
 from experiments import moving_picture, push_prediction, runs, tutorial_pictures
@@ -218,8 +221,11 @@ def export_all(page: pathlib.Path) -> None:
     [pytest.param(page, marks=[pytest.mark.slow] * (page.name in SLOW)) for page in (ROOT / "README.md", *HOWTO)],
     ids=lambda page: page.name,
 )
-def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+def test_the_python_of_a_page_runs(
+    page: pathlib.Path, data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     prepare(tmp_path, data)
+    monkeypatch.setattr(methods, "METHODS", dict(methods.METHODS))  # a page adds one
     with contextlib.chdir(tmp_path):
         if page.name == "other_tools.md":
             export_all(page)
@@ -231,6 +237,10 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
     elif page.name == "sweep_distance.md":
         travel = abs(names["motion"][0]).max((1, 2))
         assert travel[0] < travel[4] < travel[9], "longer pushes move further"
+    elif page.name == "your_method.md":
+        imagines = names["policy"].with_config(PolicyConfig(grasp_above=1.0))
+        moved = np.abs(imagines(jax.random.key(0), names["observation"]).motion).max(-1) > 0
+        assert "trans+gn" in methods.METHODS and moved.sum() == 1, "only the pushed object moves"
     elif page.name == "engines.md":
         assert not names["rollout"].fault.any()
     elif page.name == "your_cases.md":
