@@ -188,7 +188,7 @@ def in_lockstep(setting: Setting) -> Iterator[tuple[str, float]]:
     (decide,) = on_tables.load("dipn+gn", networks, engine, [PolicyConfig()])
 
     def tables() -> list[instances.Instance]:
-        return instances.hard_instances(engine, path, None, slots=slots, repeats=repeats, seed=setting.seed)
+        return instances.case_instances(engine, path, None, slots=slots, repeats=repeats, seed=setting.seed)
 
     def clear(some: list[instances.Instance]) -> None:
         with tempfile.TemporaryDirectory() as name, quiet():

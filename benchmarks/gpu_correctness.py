@@ -57,7 +57,7 @@ def weights(size: Size) -> Found:
     """
     native, path = engine("native", size), cases.hard_cases_path()
     names, slots = cases.load_cases(path)[0], table_slots()
-    tables = instances.hard_instances(native, path, names[: size.cases], slots=slots, repeats=1, seed=size.seed)
+    tables = instances.case_instances(native, path, names[: size.cases], slots=slots, repeats=1, seed=size.seed)
     scene, poses = structs.stack([table.scene for table in tables]), np.stack([table.poses for table in tables])
     keys = jax.random.split(jax.random.key(size.seed), len(tables))
     decision, _ = policy(size)(keys, scene, poses, recall_nothing)

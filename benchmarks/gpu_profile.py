@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pathlib
 import tempfile
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -67,19 +66,20 @@ def _traced(engine: Any, scene: Any, poses: np.ndarray) -> jax.profiler.ProfileD
         return jax.profiler.ProfileData.from_file(str(found))
 
 
-def kernels(data: Any, *, plane: str, lines: Sequence[str] = LINES) -> dict[str, tuple[int, float]]:
+def kernels(data: Any, *, plane: str) -> dict[str, tuple[int, float]]:
     """Return how often each kernel ran and the milliseconds that it took in all.
+
+    Both are read from the lines of the first name in `LINES` that has any event.
 
     Args:
       data: a `jax.profiler.ProfileData`.
       plane: what the names of the planes begin with that are looked at.
-      lines: what the names of their lines may begin with; those of the first that there is count.
 
     Raises:
       NotMeasured: there are none.
     """
     rows = [row for each in data.planes if each.name.startswith(plane) for row in each.lines]
-    for begin in lines:
+    for begin in LINES:
         found: dict[str, tuple[int, float]] = {}
         for event in (event for row in rows if (row.name or "").startswith(begin) for event in row.events):
             count, taken = found.get(event.name, (0, 0.0))

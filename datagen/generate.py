@@ -199,6 +199,9 @@ def generate(
         if command is not None:
             place.note(command, of=of)
         mine = range(part, job.shards(), of)
+        if not mine:
+            said = f"no shard is left for this worker: there are {job.shards()}; want --of {job.shards()} at most"
+            console.warn(f"--shard {part} --of {of}: {said}")
         held = place.counts(mine)
         todo = [index for index in mine if held.get(index) != job.size(index)]
         total = sum(map(job.size, mine))

@@ -77,6 +77,8 @@ def load_grasp_runs(runs: Sequence[pathlib.Path]) -> dict[str, dict[int, list[fl
     """
     found: dict[str, dict[int, list[float]]] = {}
     for run in runs:
+        if run.is_file():
+            raise UserError(f"--curve {run}: a file, not the folder of a run of dipn-train grasp-online")
         config = files.read_json(run / "config.json")
         if "pretrained" not in config:
             raise UserError(f"--curve {run}: no run of dipn-train grasp-online")

@@ -1,5 +1,6 @@
 """What the page on many machines gives to job managers does what the page says."""
 
+import inspect
 import pathlib
 import re
 import signal
@@ -8,6 +9,9 @@ import time
 
 import pytest
 import yaml
+from dipn_jax.datagen import cli
+
+from dipn_jax.storage import accounting
 
 PAGE = pathlib.Path(__file__).parent.parent / "docs" / "howto" / "cluster.md"
 
@@ -57,7 +61,7 @@ def test_the_script_of_an_array_queues_again_what_its_time_limit_stops_and_not_w
         job.send_signal(each)
         _wait_for_lines(tmp_path / "heard", number)
     assert job.wait(timeout=60) == code
-    assert "--shard 3 --of 1000 --threads 4" in (tmp_path / "begun").read_text()
+    assert "--shard 3 --of 200 --threads 4 --engine native" in (tmp_path / "begun").read_text()
     assert (tmp_path / "queued").exists() == queued
     assert not queued or (tmp_path / "queued").read_text() == "requeue 7_3\n"
 
@@ -67,6 +71,18 @@ def _wait_for_lines(path: pathlib.Path, lines: int) -> None:
     while not path.exists() or path.read_text().count("\n") < lines:
         assert time.monotonic() < until, f"{path.name} has no {lines} lines"
         time.sleep(0.01)
+
+
+def test_an_array_has_a_task_for_each_worker_and_a_shard_for_each_task() -> None:
+    """Jobs of SLURM and Kubernetes: a task fewer than workers leaves shards missing, and no task says so."""
+    script, job = _block("sh"), yaml.safe_load(_block("yaml"))
+    first, last = map(int, re.findall(r"--array=(\d+)-(\d+)", script)[0])
+    (of,) = map(int, re.findall(r"--of (\d+)", script))
+    (episodes,) = map(int, re.findall(r"--episodes (\d+)", script))
+    assert (first, last) == (0, of - 1) and job["spec"]["completions"] == of
+    shards = accounting.RequestedSize(episodes, inspect.signature(cli.push).parameters["shard_size"].default).shards()
+    said = f"are {shards:,} shards, ten for each of {of} workers"
+    assert shards == 10 * of and said in " ".join(PAGE.read_text().split())
 
 
 def test_the_indexed_job_gives_up_an_index_whose_user_is_mistaken() -> None:

@@ -10,19 +10,23 @@ import re
 import shutil
 from collections.abc import Callable
 
+import jax
 import numpy as np
 import page_commands
 import pytest
 import tyro
 from dipn_jax.datagen.exporting.export import NEEDS
 from dipn_jax.eval.report import paper
+from dipn_jax.train import cli
 
 from benchmarks import on_gpu
 from benchmarks.__main__ import BENCHMARKS
 from dipn_jax.commands import console
+from dipn_jax.planning import methods
+from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.sight import render
 from dipn_jax.system import files
-from experiments import moving_picture, runs, tutorial_pictures
+from experiments import moving_picture, push_prediction, runs, tutorial_pictures
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -33,7 +37,16 @@ FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(dipn-(?:datagen|train|eval) [^`]+)`")
 OPTION = re.compile(r"`(--[a-z][a-z0-9_-]*)[^`]*`")
 """An option that stands in a sentence without its command."""
-FOREIGN = {"--cpus-per-task", "--dependency", "--gpus-per-task", "--requeue", "--xla_gpu_enable_command_buffer"}
+FOREIGN = {
+    "--array",
+    "--constraint",
+    "--cpus-per-task",
+    "--dependency",
+    "--export",
+    "--gpus-per-task",
+    "--requeue",
+    "--xla_gpu_enable_command_buffer",
+}
 """Options of other programs, of which pages speak."""
 OURS = {"--dry-run", "--minutes", "--list", "--only", "--page", "--scale", "--toy", "--out", "--seed"}
 """Options of experiments and benchmarks."""
@@ -150,6 +163,29 @@ def test_the_readme_fits_on_a_screen_and_its_table_is_the_kept_one() -> None:
     assert f"for DIPN + GN on the hard tables {said}" in " ".join(text.split())
 
 
+def test_the_steps_that_a_page_recommends_are_those_of_the_learning_curves() -> None:
+    text = (ROOT / "docs" / "howto" / "your_network.md").read_text()
+    rows = re.findall(r"^\| ([\d,]+) \| ([\d,]+) \| ([\d.]+) \|$", text, re.MULTILINE)
+    table = {int(pushes.replace(",", "")): int(steps.replace(",", "")) for pushes, steps, _ in rows}
+    assert table == push_prediction.STEPS
+    for (pushes, steps), (*_, said) in zip(table.items(), rows, strict=True):
+        passes = steps * cli.PUSH.batch / pushes
+        assert said == (f"{passes:.0f}" if passes > 10 else f"{passes:.1f}")
+    assert f"{cli.PUSH.steps:,} steps, is {cli.PUSH.steps * cli.PUSH.batch / 1350:.0f} passes over the 1,350 " in text
+
+
+def test_the_rates_by_which_a_page_compares_engines_on_a_gpu_are_those_that_were_measured() -> None:
+    text = " ".join((ROOT / "docs" / "howto" / "engines.md").read_text().split())
+    rates = files.read_json(ROOT / "docs" / "benchmarks-h200.json")["figures"]
+    native, mjx, warp = (
+        round(max(rate for name, rate in rates.items() if name.startswith(f"engines.scene_seconds/{engine}/")))
+        for engine in ("native", "mjx", "warp")
+    )
+    assert f"by {native} scene seconds a second under `native` on 16 cores, and by {mjx} under `mjx`" in text
+    assert f"under `warp`, as it was at commit 4c8f9f8, by {warp}," in text
+    assert "2.3 h, and the host's 16 cores 1.2 h" in (ROOT / "docs" / "scaling.md").read_text()
+
+
 def test_the_changelog_is_short() -> None:
     versions = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1:]
     for version in versions:
@@ -185,8 +221,11 @@ def export_all(page: pathlib.Path) -> None:
     [pytest.param(page, marks=[pytest.mark.slow] * (page.name in SLOW)) for page in (ROOT / "README.md", *HOWTO)],
     ids=lambda page: page.name,
 )
-def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.Path], tmp_path: pathlib.Path) -> None:
+def test_the_python_of_a_page_runs(
+    page: pathlib.Path, data: dict[str, pathlib.Path], tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     prepare(tmp_path, data)
+    monkeypatch.setattr(methods, "METHODS", dict(methods.METHODS))  # a page adds one
     with contextlib.chdir(tmp_path):
         if page.name == "other_tools.md":
             export_all(page)
@@ -198,6 +237,10 @@ def test_the_python_of_a_page_runs(page: pathlib.Path, data: dict[str, pathlib.P
     elif page.name == "sweep_distance.md":
         travel = abs(names["motion"][0]).max((1, 2))
         assert travel[0] < travel[4] < travel[9], "longer pushes move further"
+    elif page.name == "your_method.md":
+        imagines = names["policy"].with_config(PolicyConfig(grasp_above=1.0))
+        moved = np.abs(imagines(jax.random.key(0), names["observation"]).motion).max(-1) > 0
+        assert "trans+gn" in methods.METHODS and moved.sum() == 1, "only the pushed object moves"
     elif page.name == "engines.md":
         assert not names["rollout"].fault.any()
     elif page.name == "your_cases.md":

@@ -1,5 +1,6 @@
 """Every command of ours on a page does its work, made small: in the order of the page, in one folder."""
 
+import functools
 import importlib
 import importlib.util
 import os
@@ -8,11 +9,15 @@ import shlex
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import page_commands
 import pytest
+from dipn_jax.eval.prediction import push_errors
 
 from dipn_jax.commands import console
+from dipn_jax.storage import accounting
 from dipn_jax.system import files
 from experiments import moving_picture, runs
 
@@ -111,6 +116,44 @@ def test_the_commands_of_a_page_work_at_small_scale(
         assert files.read_json(pathlib.Path("data/sweep/config.json"))["distances"] == [0.03, 0.06, 0.1]
     if left_out:
         pytest.skip(f"Ray is not installed, the others pass: {'; '.join(map(shlex.join, left_out))}")
+
+
+TO_SHARE: dict[str, Callable[[dict[str, Any]], int]] = {
+    "clear": lambda given: given["tables"].count(),
+    "sweep": lambda given: given["tables"].count(),
+    "grasp": lambda given: given["scenes_"],
+    "prediction": lambda given: push_errors.groups(given["scenes_"]),
+}
+"""What the workers of an evaluation share, by its options."""
+
+
+def asked(words: list[str]) -> dict[str, Any]:
+    """Return the options of a command of ours by name, as its function would get them; the command is not run."""
+    found: dict[str, Any] = {}
+
+    def stub(command: Callable[..., Any]) -> Callable[..., Any]:
+        return functools.wraps(command)(lambda **given: found.update(given))
+
+    known = importlib.import_module(runs.PROGRAMS[words[0]]).COMMANDS
+    assert console.run(words[0], {name: stub(command) for name, command in known.items()}, words[1:]) == 0, words
+    return found
+
+
+def test_no_job_of_a_page_has_more_workers_than_work() -> None:
+    """As pages have them, before they are made small."""
+    seen = 0
+    for page in PAGES:
+        for words in filter(page_commands.ours, page_commands.commands(page)):
+            if "--of" in words:
+                given = asked(words)
+                if words[0] == "dipn-datagen":
+                    of = given["work"].of
+                    there = accounting.RequestedSize(given["episodes"], given["shard_size"]).shards()
+                else:
+                    of, there = given["share"].of, TO_SHARE[words[1]](given)
+                assert 1 < of <= there, words
+                seen += 1
+    assert seen >= 6
 
 
 def test_every_option_of_a_page_is_kept_or_made_smaller() -> None:

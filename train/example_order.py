@@ -40,3 +40,11 @@ def batches(parts: Sequence[int], config: TrainConfig) -> Sequence[np.ndarray]:
     mixed = grain.MapDataset.mix(each, weights=config.mix) if config.mix else each[0]
     found: Sequence[np.ndarray] = mixed.batch(config.batch)
     return found
+
+
+def passes(size: int, config: TrainConfig) -> str:
+    """Return in words how often the steps of a training see each of the `size` examples that it learns from."""
+    count = config.steps * config.batch / size
+    shown = f"{count:.2g}" if count < 10 else f"{count:,.0f}"
+    more = "; only more --steps would see all" if count < 1 else ""
+    return f"{config.steps} steps of {config.batch} examples; each of {size:,} is seen {shown} times on average{more}"

@@ -149,6 +149,7 @@ def fit(
     optimizer = make_optimizer(config, examples=task.size)
     if compute.check_only:
         _claim(out, _identity(task, config, compute, initial), config, write=False)
+        console.note(f"train {task.network}: {example_order.passes(task.size, config)}")
         return {}
     if compute.compile_only:
         return _compile(task, config, optimizer, initial, compute, where)
@@ -171,6 +172,7 @@ def _fit(
     where.require_alike(identity, what="options, or folders of data")
     if where.leads:
         _claim(out, identity, config)
+        console.note(f"train {task.network}: {example_order.passes(task.size, config)}")
     where.wait("claimed")
     moments, begin, best = _resume(out, model, optimizer)
     where.require_alike({"step": begin}, what="the step to continue at; is --out one folder for all?")

@@ -181,18 +181,15 @@ def contact_depths(models: list[mujoco.MjModel], qpos: np.ndarray) -> np.ndarray
     return deepest
 
 
-def raycast(
-    scenes: Scene, poses: Float[Array, "B N 7"], *, pixels: int = WORKSPACE.pixels
-) -> tuple[Float[np.ndarray, "B {pixels} {pixels}"], Int[np.ndarray, "B {pixels} {pixels}"]]:
+def raycast(scenes: Scene, poses: Float[Array, "B N 7"]) -> tuple[Float[np.ndarray, "B H W"], Int[np.ndarray, "B H W"]]:
     """Return what MuJoCo's ray caster sees from straight above: the reference of `dipn_jax.sight.render`.
 
     Args:
       scenes: B scenes.
       poses: metres and quaternions wxyz, workspace.
-      pixels: side of the square view, 2 mm a pixel.
 
     Returns:
-      Heights in metres and labels (object slots, ABSENT on the table).
+      Heights in metres and labels (object slots, ABSENT on the table) of the workspace, a pixel each.
     """
     scenes, poses = jax.tree.map(np.asarray, scenes), np.asarray(poses)
     models = [
@@ -203,6 +200,7 @@ def raycast(
     sims.set_models(models)
     sims.qpos[:, 2] = 2 * CAMERA_HEIGHT  # the gripper is above the camera
     sims.qpos[:, GRIPPER_DOF:] = poses.reshape(len(poses), -1)
+    pixels = WORKSPACE.pixels
     at = (np.arange(pixels) - (pixels - 1) / 2) * WORKSPACE.pixel
     x, y = np.meshgrid(at, at)
     start = np.stack([x.ravel(), y.ravel(), np.full(x.size, CAMERA_HEIGHT)], -1)

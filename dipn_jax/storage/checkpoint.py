@@ -278,7 +278,8 @@ def load_network(run: pathlib.Path | str = "builtin", *, network: str) -> nnx.Mo
     forking.check()
     run = find(files.not_empty(run), network=network)
     if not run.is_dir():
-        raise UserError(f"checkpoint {run}: no such folder; {ACCEPTED_RUNS_TEXT}")
+        what = "a file, not a run's folder" if run.exists() else "no such folder"
+        raise UserError(f"checkpoint {run}: {what}; {ACCEPTED_RUNS_TEXT}")
     found = newest(run)
     if found is None:
         raise UserError(f"checkpoint {run}: no whole step under checkpoints/; {ACCEPTED_RUNS_TEXT}, or train again")

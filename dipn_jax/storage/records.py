@@ -186,15 +186,14 @@ def read_episodes(folder: pathlib.Path | str) -> PushEpisode | GraspEpisode | Se
     return episodes
 
 
-def load(folder: pathlib.Path, *, kind: str, space: Space | None = None) -> tuple[Any, str]:
-    """Load a whole data set (a few kilobytes an episode), after checking every shard.
+def load(folder: pathlib.Path, *, kind: str) -> tuple[Any, str]:
+    """Load a whole data set into memory (a few kilobytes an episode), after checking every shard.
 
     Where episodes that were asked for have not been made, one line says so.
 
     Args:
       folder: the data set.
       kind: a key of `layout.KINDS`.
-      space: where to put the episodes; None: in memory.
 
     Returns:
       The episodes `[B, ...]` in the order of the shards, and a fingerprint of the data set.
@@ -203,7 +202,7 @@ def load(folder: pathlib.Path, *, kind: str, space: Space | None = None) -> tupl
       UserError: as `opened`; or a shard cannot be read.
     """
     found = opened(folder, kind=kind)
-    return Episodes([(found, range(len(found)))], space or Space()).whole(), found.fingerprint
+    return Episodes([(found, range(len(found)))], Space()).whole(), found.fingerprint
 
 
 def opened(folder: pathlib.Path, *, kind: str) -> DataSet:

@@ -70,22 +70,6 @@ class Space:
         self._taken -= size
 
 
-class Filled:
-    """Arrays that are filled in parts, and made once: no more space than they need."""
-
-    def __init__(self, count: int, space: Space, *, what: str) -> None:
-        """Prepare for `count` rows; `what` is as of `Space.arrays`."""
-        self.whole: Any = None
-        self._count, self._space, self._what = count, space, what
-
-    def put(self, begin: int, part: Any) -> None:
-        """Put rows, a struct with a leading `[B]`, at the numbers from `begin` on."""
-        part = jax.tree.map(np.asarray, part)
-        if self.whole is None:
-            self.whole = self._space.arrays(self._count, part, what=self._what)
-        put(self.whole, begin, part)
-
-
 def put(whole: Any, begin: int, part: Any) -> None:
     """Put rows `part [B, ...]` into arrays `whole [N, ...]` from row `begin` on."""
     for array, leaf in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):

@@ -29,14 +29,10 @@ def instructions(*, info: pathlib.Path = pathlib.Path("/proc/cpuinfo")) -> str:
     return next((level for level, needed in levels.items() if needed <= flags), platform.machine().replace("_", "-"))
 
 
-def boot_id(*, file: pathlib.Path = pathlib.Path("/proc/sys/kernel/random/boot_id")) -> str | None:
-    """Return what tells this start of the machine from others; None where the system does not say it.
-
-    Args:
-      file: where Linux says it.
-    """
+def boot_id() -> str | None:
+    """Return what tells this start of the machine from others; None where the system does not say it."""
     try:
-        return file.read_text(encoding="ascii").strip() or None
+        return pathlib.Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip() or None
     except (OSError, UnicodeDecodeError):
         return None
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from dipn_jax.engine import PhysicsConfig
 from dipn_jax.structs import Scene
-from dipn_jax.workspace import GRIPPER, Gripper
+from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import shapes
 
 MARK = "dipn_jax"
@@ -25,8 +25,8 @@ OBJECT_FRICTION_RATIO = 0.5 / 0.35
 """Friction between objects over that between object and table. Source: DIPN's released code."""
 
 
-def _gripper(gripper: Gripper) -> str:
-    g = gripper
+def _gripper() -> str:
+    g = GRIPPER
     length, width = g.finger_length / 2, g.pad_width / 2
     link = (g.thickness - g.pad_depth) / 2
     fingers = []
@@ -49,8 +49,8 @@ def _gripper(gripper: Gripper) -> str:
     )
 
 
-def _actuators(gripper: Gripper) -> str:
-    g = gripper
+def _actuators() -> str:
+    g = GRIPPER
     moved = g.mass + 2 * g.finger_mass
     rows = []
     for name, inertia, force in (
@@ -136,7 +136,6 @@ def mjcf(
     scene: Scene,
     *,
     config: PhysicsConfig,
-    gripper: Gripper = GRIPPER,
     generic: bool = False,
     alike: bool = False,
 ) -> str:
@@ -145,7 +144,6 @@ def mjcf(
     Args:
       scene: one scene (no batch axis), numpy arrays; empty slots are kept as bodies that touch nothing.
       config: solver settings.
-      gripper: dimensions and gains.
       generic: placeholder geometry in every part (see the module's docstring).
       alike: add meshes that nothing uses, so that all scenes with the same number of slots have models of one layout.
 
@@ -187,9 +185,9 @@ def mjcf(
 </default>
 <asset>{extra}{"".join(a for _, a in parts)}</asset>
 <worldbody><geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="0"/>
-{_gripper(gripper)}
+{_gripper()}
 {"".join(b for b, _ in parts)}</worldbody>
 <contact>{"".join(floor)}</contact>
 <equality><joint joint1="left" joint2="right" polycoef="0 1 0 0 0" solref="0.005 1"/></equality>
-<actuator>{_actuators(gripper)}</actuator>
+<actuator>{_actuators()}</actuator>
 {nearest}</mujoco>"""

@@ -98,9 +98,8 @@ def clear(
     networks = Networks(push_net, grasp_net, value_net)
     physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
     if launch.uses_cluster:
-        launching.evaluate(
-            "clear", asked, resume.Partial(out, given, inputs=evaluation.inputs(networks.runs(method), tables))
-        )
+        whole = resume.Partial(out, given, inputs=evaluation.inputs(networks.runs(method), tables))
+        launching.evaluate("clear", asked, whole, total=tables.count())
         return
     (decide,) = on_tables.load(method, networks, physics, [config], camera=camera)
     longest, runs = max(*distances, evaluation.SIMULATED_PUSH), networks.runs(method)

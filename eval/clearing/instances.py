@@ -50,7 +50,7 @@ class Instance:
         return self.grasps + self.pushes
 
 
-def hard_instances(
+def case_instances(
     engine: Engine,
     path: pathlib.Path,
     names: list[str] | None,

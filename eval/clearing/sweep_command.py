@@ -101,7 +101,7 @@ def sweep(
     inputs = evaluation.inputs(networks.runs("dipn+gn"), tables)
     kept = resume.Partial(out, given, inputs=inputs, part=share.number_and_count())
     if launch.uses_cluster:
-        launching.evaluate("sweep", asked, kept)
+        launching.evaluate("sweep", asked, kept, total=tables.count())
         return
     command = command_line.words(sweep, asked, without=command_line.WORKER_OPTIONS)
     with owner.owned(out):

@@ -70,17 +70,26 @@ class Tables:
             return scenes.parse_objects(self.objects, ranges=self.ranges).slots
         return int(case_files.load_cases(path)[1].shape.shape[1])
 
+    def count(self) -> int:
+        """Return the number of tables; nothing is simulated."""
+        from dipn_jax.world import cases as case_files
+
+        path = self.path()
+        if path is None:
+            return self.instances
+        return self.instances * len(self.names or case_files.load_cases(path)[0])
+
     def make(self, engine: Engine, *, seed: int) -> list[Instance]:
         """Make all tables, at rest."""
         from dipn_jax.world import scenes
 
-        from .instances import hard_instances, random_instances
+        from .instances import case_instances, random_instances
 
         path = self.path()
         if path is None:
             config = scenes.parse_objects(self.objects, ranges=self.ranges)
             return random_instances(engine, config, count=self.instances, seed=seed)
-        return hard_instances(
+        return case_instances(
             engine,
             path,
             list(self.names) or None,

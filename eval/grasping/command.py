@@ -42,7 +42,7 @@ def grasp(
 
     Success against grasps learnt from, with a band over seeds (curve.png, and in metrics.json
     online/{with,without}/GRASPS/...):
-      dipn-eval grasp --curve runs/online/* --out results/curve
+      dipn-eval grasp --curve runs/online/*/ --out results/curve
 
     Args:
       out: folder for metrics.json, pictures and every step of every table.
@@ -90,7 +90,7 @@ def grasp(
         physics = grouped.group_by_object_count(make_engine(engine, threads=threads))
         scorer = scorers.load_scorer(run, aids=aids)
     if launch.uses_cluster:
-        launching.evaluate("grasp", asked, partial)
+        launching.evaluate("grasp", asked, partial, total=scenes_)
         return
     with owner.owned(out):
         if shares.is_made(out, "grasp", share, partial):

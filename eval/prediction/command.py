@@ -40,7 +40,7 @@ def predict(
 
     Error against number of pushes, with a band over seeds (curve-all.png, curve-all.md, and in
     metrics.json push_error/curve/PUSHES/...):
-      dipn-eval prediction --curve runs/curve/* --scenes 1000 --out results/curve
+      dipn-eval prediction --curve runs/curve/*/ --scenes 1000 --out results/curve
 
     Args:
       out: folder for metrics.json and pictures.
@@ -76,7 +76,7 @@ def predict(
     partial = resume.Partial(out, settings, inputs=runs, part=share.number_and_count())
     truth = make_engine(engine, threads=threads)
     if launch.uses_cluster:
-        launching.evaluate("prediction", asked, partial)
+        launching.evaluate("prediction", asked, partial, total=push_errors.groups(scenes_))
         return
     with owner.owned(out):
         if shares.is_made(out, "prediction", share, partial):

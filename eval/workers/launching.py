@@ -23,19 +23,21 @@ PARTS_FOLDER = "parts"
 """Name of the folder with the parts, in that of the evaluation."""
 
 
-def evaluate(kind: str, asked: Mapping[str, Any], partial: resume.Partial) -> None:
+def evaluate(kind: str, asked: Mapping[str, Any], partial: resume.Partial, *, total: int) -> None:
     """Make the parts of an evaluation that are missing, and put all together.
 
     Args:
       kind: command of dipn-eval.
       asked: its arguments by name, `share` and `launch` among them.
       partial: of the whole evaluation.
+      total: number of tables, or of groups of pushes, that the parts share.
 
     Raises:
-      UserError: there is a part of another evaluation; or a task raised it.
+      UserError: there are more parts than that; there is a part of another evaluation; or a task raised it.
     """
     from dipn_jax.storage import owner
 
+    asked["share"].rows(total)  # raises before anything is launched
     out: pathlib.Path = asked["out"]
     where: Launch = asked["launch"]
     every = [Share(shard, asked["share"].of) for shard in range(asked["share"].of)]

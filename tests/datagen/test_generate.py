@@ -126,6 +126,17 @@ def test_the_manifest_is_written_once_however_many_shards_there_are(
     ).read_bytes()
 
 
+def test_a_worker_without_a_shard_says_so(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
+    job = dataclasses.replace(JOB, kind="images", episodes=2, shard_size=1, actions=1)
+    generate(job, tmp_path, part=2, of=4)
+    said = capsys.readouterr()
+    assert "warning: --shard 2 --of 4: no shard is left for this worker: there are 2; want --of 2 at most\n" in said.err
+    assert "0 of 2 shards are there" in said.out
+    generate(job, tmp_path, part=1, of=2)
+    said = capsys.readouterr()
+    assert "warning" not in said.err and "1 of 2 shards are there" in said.out
+
+
 def test_a_data_set_whose_extension_is_killed_stays_whole(copy: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The last shard is made longer; killed before or after that, the manifest does not contradict it."""
     write, update = shards.write_shard, manifest.update_manifest

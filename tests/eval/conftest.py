@@ -45,7 +45,7 @@ def cleared(engine: Any, runs: dict[str, pathlib.Path], tmp_path_factory: pytest
     networks = Networks(push=runs["dipn"], grasp=runs["grasp"])
 
     def table(name: str) -> list[instances.Instance]:
-        return instances.hard_instances(engine, cases.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
+        return instances.case_instances(engine, cases.hard_cases_path(), [name], slots=6, repeats=1, seed=0)
 
     def load(**config: Any) -> on_tables.TablePolicy:
         return on_tables.load("dipn+gn", networks, engine, [PolicyConfig(candidates=4, **config)])[0]

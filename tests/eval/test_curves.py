@@ -81,5 +81,7 @@ def test_mean_and_band_over_seeds(tmp_path: pathlib.Path) -> None:
 
 def test_another_run_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(UserError, match=r"config\.json: a file, not the folder of a run"):
+        curves.load_grasp_runs([tmp_path / "config.json"])
     with pytest.raises(UserError, match="no run of dipn-train grasp-online"):
         curves.load_grasp_runs([tmp_path])

@@ -52,3 +52,15 @@ def test_the_first_examples_are_of_the_first_data_sets() -> None:
 def test_a_mix_that_makes_no_sense_is_refused(parts: tuple[int, ...], mix: tuple[float, ...], says: str) -> None:
     with pytest.raises(UserError, match=says):
         example_order.batches(parts, dataclasses.replace(CONFIG, mix=mix))
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        (199_000, "each of 199,000 is seen 0.24 times on average; only more --steps would see all"),
+        (48_000, "each of 48,000 is seen 1 times on average"),
+        (20, "each of 20 is seen 2,400 times on average"),
+    ],
+)
+def test_a_training_says_how_often_it_sees_its_examples(size: int, said: str) -> None:
+    assert example_order.passes(size, TrainConfig(steps=1500)) == f"1500 steps of 32 examples; {said}"

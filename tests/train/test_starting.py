@@ -38,7 +38,9 @@ def test_options_data_and_folder_can_be_checked_without_writing(
     out = tmp_path / "run"
     push = ["push", "--data", str(data["push"]), "--out", str(out), "--check-only"]
     assert console.run("test", cli.COMMANDS, push) == 0
-    assert capfd.readouterr().out == f"{out}: nothing is wrong with options and data\n" and not out.exists()
+    said = capfd.readouterr()
+    assert said.out == f"{out}: nothing is wrong with options and data\n" and not out.exists()
+    assert said.err == "train dipn: 1500 steps of 32 examples; each of 20 is seen 2,400 times on average\n"
     assert console.run("test", cli.COMMANDS, [*push, "--limit", "99"]) == 2
     assert "--limit 99: want 1 to 20" in capfd.readouterr().err and not out.exists()
     files.write_json(out / "config.json", {"network": "grasp"})

@@ -159,6 +159,9 @@ def test_only_the_newest_steps_are_kept(tmp_path: pathlib.Path) -> None:
 def test_a_run_that_cannot_be_used_is_named(tmp_path: pathlib.Path) -> None:
     with pytest.raises(UserError, match="no such folder"):
         checkpoint.load_network(tmp_path / "nowhere", network="grasp")
+    (tmp_path / "sweep.json").touch()
+    with pytest.raises(UserError, match=r"sweep\.json: a file, not a run's folder; give a run"):
+        checkpoint.load_network(tmp_path / "sweep.json", network="grasp")
     with pytest.raises(UserError, match="no whole step"):
         checkpoint.load_network(tmp_path, network="grasp")
     _save(tmp_path, 1)

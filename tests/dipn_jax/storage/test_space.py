@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dipn_jax.errors import UserError
-from dipn_jax.storage.space import FREE_DISK_BYTES, Filled, Space
+from dipn_jax.storage.space import FREE_DISK_BYTES, Space
 
 LIKE = {"square": np.zeros((2, 3)), "half": np.zeros(2, np.float16)}
 SIZE = 5 * (3 * 8 + 2)
@@ -50,15 +50,3 @@ def test_a_disk_without_room_is_one_line(tmp_path: pathlib.Path, monkeypatch: py
     monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: made.append(dir) or make(dir=dir))  # type: ignore[func-returns-value]
     assert in_files(Space(0, tmp_path).arrays(5, LIKE, what="rows")) == [True, True]
     assert made == [tmp_path, tmp_path], "on the disk that has been looked at"
-
-
-@pytest.mark.parametrize("memory", [0.0, 1.0])
-def test_rows_that_are_made_in_parts_fill_arrays_of_their_size(memory: float, tmp_path: pathlib.Path) -> None:
-    made = Filled(5, Space(memory, tmp_path), what="rows")
-    for begin in (0, 2, 4):
-        part = np.arange(begin, min(begin + 2, 5))
-        made.put(begin, {"square": part**2, "half": part.astype(np.float16) / 2})
-    np.testing.assert_array_equal(made.whole["square"], np.arange(5) ** 2)
-    np.testing.assert_array_equal(made.whole["half"], np.arange(5) / 2)
-    assert made.whole["half"].dtype == np.float16 and in_files(made.whole) == [memory == 0] * 2
-    assert memory == 0 or made.whole["half"].base is None

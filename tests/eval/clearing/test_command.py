@@ -19,7 +19,7 @@ from dipn_jax.networks.dipn import DipnConfig
 from dipn_jax.networks.grasp import GraspConfig
 from dipn_jax.networks.vpg import VpgConfig
 from dipn_jax.planning import planner, predictors
-from dipn_jax.planning.methods import Networks
+from dipn_jax.planning.methods import METHODS, Networks
 from dipn_jax.planning.policy_config import PolicyConfig
 from dipn_jax.storage import checkpoint
 from dipn_jax.world import cases, scenes
@@ -54,7 +54,7 @@ def _load(method: str, networks: Networks, engine: Any, **config: Any) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["rea+dipn", "dqn+gn", "vpg", "gn", "physics+gn"])
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_decides_on_every_table_by_itself(
     method: Any, engine: Any, settled: Any, runs: dict[str, pathlib.Path]
 ) -> None:
@@ -78,6 +78,10 @@ def test_every_method_decides_on_every_table_by_itself(
         assert not together.is_push.any()
         rash = _load(method, networks, engine, aids=("table",))
         assert (rash(keys, scene, poses, none).grasp_score > together.grasp_score).all()
+    if method == "dipn+gn+actions":
+        assert (together.value_now <= 0).all(), "what is compared is no number of misses"
+    elif method == "dipn+gn":
+        assert (together.value_now > 0).all(), "what is compared is no mean score"
     if method == "physics+gn":
         assert np.abs(together.motion).max() > 0.01, "the engine was not asked, or moved nothing"
 
@@ -114,14 +118,14 @@ def test_tables_are_a_case_file_or_random() -> None:
 def test_a_repeat_of_a_case_does_not_depend_on_the_number_of_repeats(engine: Any) -> None:
     path = cases.hard_cases_path()
     names, scene, poses = cases.load_cases(path, slots=6)
-    few, more = (instances.hard_instances(engine, path, names[1:3], slots=6, repeats=count, seed=0) for count in (2, 3))
+    few, more = (instances.case_instances(engine, path, names[1:3], slots=6, repeats=count, seed=0) for count in (2, 3))
     assert [each.name for each in more] == [names[1]] * 3 + [names[2]] * 3
     for here, there in zip(few, [more[0], more[1], more[3], more[4]], strict=True):
         np.testing.assert_array_equal(here.scene.mass, there.scene.mass)
         np.testing.assert_allclose(here.poses, there.poses, atol=1e-6)
     assert [table.number for table in few] == [more[i].number for i in (0, 1, 3, 4)]
     assert len({table.number for table in more}) == 6, "each has random numbers of its own"
-    placed = instances.hard_instances(engine, path, names[1:2], slots=6, repeats=1, seed=0, perturbed=False)[0]
+    placed = instances.case_instances(engine, path, names[1:2], slots=6, repeats=1, seed=0, perturbed=False)[0]
     np.testing.assert_array_equal(placed.scene.mass, scene.mass[1])
     assert (more[0].scene.mass != scene.mass[1])[scene.shape[1] >= 0].all(), "the first repeat is as it is placed"
     there = scene.shape[1] >= 0
@@ -177,4 +181,14 @@ def test_a_longer_push_is_harder_to_predict(engine: Any) -> None:
     near, far = (values[f"sweep/{name}/push_error/all"] for name in ("0.03", "0.12"))
     assert 0 <= near < far <= 1
     figures = {f"sweep/{name}/completion": 1.0 for name in ("0.03", "0.12", "chosen")}
-    assert "chosen" in sweeping.table(values | figures) and sweeping.figure(values | figures)
+    assert "chosen" in sweeping.table(values | figures)
+
+
+def test_a_sweep_is_drawn_at_its_distances_and_the_chosen_one_as_a_line() -> None:
+    swept = {f"sweep/{name}/completion": done for name, done in (("0.12", 0.5), ("0.03", 0.75), ("chosen", 1.0))}
+    axes = sweeping.figure(swept | {"sweep/0.03/completion_low": 0.25, "sweep/0.12/completion_low": 0.125}).axes
+    drawn = {axis.get_title(): [line.get_xydata().tolist() for line in axis.lines] for axis in axes}
+    value, low, _, chosen = drawn["completion"]
+    assert (value, low) == ([[3.0, 0.75], [12.0, 0.5]], [[3.0, 0.25], [12.0, 0.125]])
+    assert chosen == [[0.0, 1.0], [1.0, 1.0]], "from side to side"
+    assert np.isnan(drawn["push error, moved"][0][0][1]) and len(drawn["push error, moved"]) == 3

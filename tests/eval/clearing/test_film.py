@@ -36,7 +36,7 @@ def _to(name: str, value: np.ndarray) -> Callable[[Arrays], None]:
         (_without("label"), "no array label"),
         (_to("what", np.zeros(2)), r"array what is float64 \[2\], want U"),
         (_to("what", np.array("push")), "array what is"),
-        (_to("what", np.array(["push"] * 3)), "3 actions, 3 states|array push is"),
+        (_to("what", np.array(["push"] * 3)), "array push is"),
         (_to("mass", np.ones(4, np.float32)), r"array mass is float32 \[4\], want f \['N'\] with"),
         (_to("poses", np.ones((3, 3, 6), np.float32)), "array poses is"),
         (_to("shape", np.ones((3, 3), bool)), "array shape is bool"),

@@ -23,6 +23,6 @@ def test_a_case_that_does_not_come_to_rest_is_named(engine: Any, tmp_path: pathl
         )
     )
     with pytest.raises(UserError, match=r"case b/\.\. of .* does not come to rest"):
-        instances.hard_instances(engine, path, None, slots=2, repeats=1, seed=0)
+        instances.case_instances(engine, path, None, slots=2, repeats=1, seed=0)
     with pytest.raises(UserError, match=rf"^--names nosuch 7: not in {path}; it has a, b/\.\.$"):
-        instances.hard_instances(engine, path, ["nosuch", "a", "7"], slots=2, repeats=1, seed=0)
+        instances.case_instances(engine, path, ["nosuch", "a", "7"], slots=2, repeats=1, seed=0)

@@ -205,7 +205,9 @@ def test_grasp_evaluation_writes_what_it_promises(
     values = rates.rates(found, tables, others=2)
     assert values["attempts"] == sum(table.grasps for table in tables) >= 3 and values["scenes"] == 3
     assert sum(value for key, value in values.items() if key.startswith("table/")) == 3
-    assert 0 <= values["other_grasps/ceiling"] <= 1
+    held, saved = found["held"].sum(), found["missed_held"].sum()
+    assert values["other_grasps/missed"] == values["attempts"] - held > 0
+    assert values["other_grasps/ceiling"] == pytest.approx((held + saved) / values["attempts"])
     for name in ("gn", "random_foreground"):
         assert 0 <= values[f"grasp_success/{name}_low"] <= values[f"grasp_success/{name}"] <= 1
 

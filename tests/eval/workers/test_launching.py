@@ -11,6 +11,7 @@ from dipn_jax.eval.workers import launching
 
 from dipn_jax.commands import console, launch
 from dipn_jax.commands.launch import Launch
+from dipn_jax.errors import UserError
 
 WORDS = ("clear", "--method", "gn", "--cases", "random", "--objects", "1", "--instances", "3", "--aids")
 """A small evaluation."""
@@ -74,12 +75,55 @@ def test_a_mistake_of_the_users_in_a_task_is_one_line(
     tiny: dict[str, pathlib.Path],
     tmp_path: pathlib.Path,
     capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray", "--of", "4") == 2
+    def mistaken(*_: Any) -> None:
+        raise UserError("checkpoint runs/gn: no such folder")
+
+    monkeypatch.setattr(launching, "make_part", mistaken)
+    assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray", "--of", "3") == 2
     said = capfd.readouterr().err
-    assert "--of 4: more workers than the 3 that can be shared" in said and "Traceback" not in said
+    assert "error: checkpoint runs/gn: no such folder" in said and "Traceback" not in said
     assert _run(tmp_path / "out", tiny["grasp"], "--launcher", "ray") == 2
     assert "--launcher ray makes all shards: give --of" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "most"),
+    [
+        (("clear", "--method", "gn", "--grasp-net", "grasp", "--instances", "2"), 20),
+        (("clear", "--method", "gn", "--grasp-net", "grasp", "--names", "01", "06"), 2),
+        (("clear", "--method", "gn", "--grasp-net", "grasp", "--cases", "random", "--instances", "3"), 3),
+        (("sweep", "--push-net", "dipn", "--grasp-net", "grasp", "--pushes", "0"), 10),
+        (("grasp", "--grasp-net", "grasp", "--scenes", "5"), 5),
+        (("prediction", "--push-net", "dipn", "--scenes", "129"), 3),
+    ],
+    ids=lambda given: "-".join(given[::4]) if isinstance(given, tuple) else str(given),
+)
+def test_more_parts_than_can_be_shared_are_refused_before_anything_is_launched(
+    words: tuple[str, ...],
+    most: int,
+    tiny: dict[str, pathlib.Path],
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    begun: list[int] = []
+
+    def run(_: Any, tasks: Any, **__: Any) -> Iterator[Any]:
+        begun.append(len(tasks))
+        yield from ()
+
+    monkeypatch.setattr(launch, "run", run)
+    out = tmp_path / "out"
+    for of in (most + 1, most):
+        given = [str(tiny.get(word, word)) for word in words[1:]]
+        options = ["--launcher", "ray", "--of", str(of), "--out", str(out)]
+        assert console.run("test", cli.COMMANDS, [words[0], *given, *options]) == 2
+        said = capfd.readouterr().err
+        if of > most:
+            assert f"--of {of}: more workers than the {most} that can be shared" in said and not out.exists()
+    assert begun == [most] and "no part of an evaluation" in said, "the parts that nobody made"
 
 
 @pytest.mark.slow
