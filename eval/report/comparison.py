@@ -21,6 +21,11 @@ FRAMES = 10
 """Number of pictures in a filmstrip."""
 FILM_ROWS = 4
 """Number of steps in the figure of predictions."""
+NOTE = (
+    "Per cent, with bootstrap 95 % intervals over cases, then over their repeats (random tables: over tables); the "
+    "numbers of the paper are of its own simulator, robot and objects."
+)
+"""What is said below the tables of results."""
 COUNTS = ("instances", "grasps", "pushes")
 """Metrics that are numbers of something."""
 CAUSES = {
@@ -108,8 +113,7 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
                 f"the best, the median and the worst table</h4>{{{place}}}"
             )
     parts.append(
-        "<p class=note>Per cent, with bootstrap 95 % intervals over tables; the numbers of the paper are of its own "
-        "simulator, robot and objects.</p><h2>What was seen, chosen, imagined, and what happened</h2>"
+        f"<p class=note>{NOTE}</p><h2>What was seen, chosen, imagined, and what happened</h2>"
         "<p>Pushes first: the scene with the chosen action; the image predicted for the best push, with the values "
         "compared (gamma times the mean grasp score on it, and the mean score now); the scene after.</p>{steps}"
     )

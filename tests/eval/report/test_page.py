@@ -102,6 +102,7 @@ def test_what_users_named_is_text_in_pages_and_figures(
     ours = {"html", "meta", "title", "style", "h1", "h2", "h3", "h4", "p", "table", "tr", "th", "td", "img"}
     assert tags.found == ours, "none of them comes from a name"
     assert "<h2>Networks</h2><table>" in text
+    assert "intervals over cases, then over their repeats" in text, "as lockstep.summary computes them"
     assert text.count("data:image/png;base64,") == 4, "each figure stands in its place, once"
 
 
