@@ -11,11 +11,11 @@ import numpy as np
 
 from dipn_jax.commands import pages
 from dipn_jax.errors import UserError
-from dipn_jax.system import files, typed
 
 from .. import drawing
-from ..clearing import film, lockstep, merging
-from . import paper
+from ..clearing import film, lockstep
+from . import conditions, paper
+from .cleared import COUNTS, Cleared
 
 FRAMES = 10
 """Number of pictures in a filmstrip."""
@@ -26,8 +26,6 @@ NOTE = (
     "numbers of the paper are of its own simulator, robot and objects."
 )
 """What is said below the tables of results."""
-COUNTS = ("instances", "grasps", "pushes")
-"""Metrics that are numbers of something."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",
@@ -36,44 +34,6 @@ CAUSES = {
     "fault": "the simulation went wrong",
 }
 """How a table can end, and how the report says it."""
-
-
-_SETTINGS = {"method": str, "label": str, "tables.cases": str, "tables.objects": object}
-"""Form of `settings.json`."""
-_EPISODE = {name: form for name, form in merging.EPISODE.items() if name != "held"}
-"""What a report reads of an entry of `episodes.json`."""
-
-
-class Cleared:
-    """The results in the folder of a `dipn-eval clear`."""
-
-    def __init__(self, folder: pathlib.Path) -> None:
-        self.folder = folder
-        self.values = files.read_json(folder / "metrics.json", wanted={str: typed.Maybe(float)})
-        files.read_json(folder / "metrics.json", wanted=dict.fromkeys(COUNTS, typed.Whole()))
-        settings = files.read_json(folder / "settings.json", wanted=_SETTINGS)
-        self.method, self.label = settings["method"], settings["label"]
-        cases = settings["tables.cases"]
-        self.tables = _tables_name(cases, settings["tables.objects"])
-        self.episodes = files.read_json(folder / "episodes.json", wanted=[_EPISODE])
-        if not self.episodes:
-            raise UserError(f"{folder / 'episodes.json'}: lists no table; give a folder that dipn-eval clear wrote")
-
-    def film(self, entry: dict[str, Any]) -> film.Film:
-        """Return the film of a table that is listed.
-
-        Raises:
-          UserError: it is damaged, or listed under a name that leads out of the folder.
-        """
-        try:
-            return film.load(typed.inside(self.folder, entry["file"]))
-        except typed.Misfit as error:
-            raise UserError(f"{self.folder / 'episodes.json'}: {error}; clear the tables again") from None
-
-    @property
-    def name(self) -> str:
-        """The name of the method, with its label if it has one."""
-        return f"{self.method} ({self.label})" if self.label else self.method
 
 
 def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
@@ -102,7 +62,8 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
     for tables in dict.fromkeys(one.tables for one in all_cleared):
         rows = [one for one in all_cleared if one.tables == tables]
         results, causes = results_and_causes(rows)
-        parts.append(f"<h3>{pages.escaped(tables)}</h3>{results}")
+        notes = "".join(f"<p class=note>{pages.escaped(note)}</p>" for note in notes_below(rows))
+        parts.append(f"<h3>{pages.escaped(tables)}</h3>{results}{notes}")
         parts.append(f"<p>Why tables were not cleared:</p>{causes}{{course-{tables}}}")
         figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
@@ -126,6 +87,11 @@ def results_and_causes(rows: list[Cleared]) -> tuple[str, str]:
     return _table(rows, paper.TABLE.get(rows[0].tables, {})), _causes(rows)
 
 
+def notes_below(rows: list[Cleared]) -> list[str]:
+    """Return what is said below a table of results: how its rows were made, and in what they differ."""
+    return conditions.notes({one.name: one.conditions for one in rows})
+
+
 def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> str:
     head = ["", "tables", "grasps", "pushes", *[f"{column.replace('_', ' ')} %" for column in paper.COLUMNS]]
     lines = []
@@ -142,14 +108,6 @@ def _cause(one: Cleared, entry: dict[str, Any]) -> str:
     ended = str(entry["ended"])
     grasped = ended == "pushed out" and str(one.film(entry).what[-1]) != "push"
     return "thrown out" if grasped else ended
-
-
-def _tables_name(cases: str, objects: str) -> str:
-    """Return the name of a table of results: the hard instances, random-N, or a case file of the user's own."""
-    if cases in ("hard", "random"):
-        return cases if cases == "hard" else f"random-{objects}"
-    stem = pathlib.Path(cases).stem
-    return f"own-{stem}" if stem in paper.TABLE else stem
 
 
 def _causes(rows: list[Cleared]) -> str:

@@ -10,12 +10,6 @@ from dipn_jax.system import files
 from experiments.fuzz_parsers import PARSERS
 
 
-def test_tables_are_named_so_that_only_those_of_the_paper_stand_beside_its_numbers() -> None:
-    assert comparison._tables_name("hard", "10") == "hard" and comparison._tables_name("random", "30") == "random-30"
-    assert comparison._tables_name("my/hard.json", "10") == "own-hard"
-    assert comparison._tables_name("my/a.json", "") == "a"
-
-
 @pytest.mark.slow
 def test_the_course_of_clearing_is_the_share_left_after_each_action(cleared: Any) -> None:
     tables, out = cleared

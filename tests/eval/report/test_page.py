@@ -112,6 +112,8 @@ def test_two_folders_of_one_method_and_label_are_refused(one_table: pathlib.Path
         page.write(tmp_path / "o", page.Sources(clears=[one_table, other]))
     assert not (tmp_path / "o").exists()
     settings = files.read_json(other / "settings.json")
-    files.write_json(other / "settings.json", settings | {"label": "again"})
+    files.write_json(other / "settings.json", settings | {"label": "again", "seed": 7})
     values = page.write(tmp_path / "o", page.Sources(clears=[one_table, other]))
     assert values["clear/hard/again/gn/grasps"] == values["clear/hard/gn/grasps"]
+    written = (tmp_path / "o" / "report.html").read_text()
+    assert "<p class=note>Rows of different tables: --seed not recorded (gn), 7 (gn (again)).</p>" in written
