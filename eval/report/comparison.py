@@ -26,6 +26,8 @@ NOTE = (
     "numbers of the paper are of its own simulator, robot and objects."
 )
 """What is said below the tables of results."""
+MEASURES = ("completion", "grasps_that_held", *paper.COLUMNS[1:])
+"""Metrics of the table of results: those of the paper, and a share that no grasp of two objects raises."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",
@@ -93,13 +95,15 @@ def notes_below(rows: list[Cleared]) -> list[str]:
 
 
 def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> str:
-    head = ["", "tables", "grasps", "pushes", *[f"{column.replace('_', ' ')} %" for column in paper.COLUMNS]]
+    head = ["", "tables", "grasps", "pushes", *[f"{measure.replace('_', ' ')} %" for measure in MEASURES]]
     lines = []
     for one in rows:
         counts = [str(one.values[key]) for key in COUNTS]
-        lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in paper.COLUMNS]])
+        lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in MEASURES]])
     for method, numbers in published.items():
-        lines.append([f"{method}, the paper", "", "", "", *[f"{number:.1f}" for number in numbers]])
+        known = dict(zip(paper.COLUMNS, numbers, strict=True))
+        shares = [f"{known[key]:.1f}" if key in known else "" for key in MEASURES]
+        lines.append([f"{method}, the paper", "", "", "", *shares])
     return pages.table(head, lines)
 
 
