@@ -52,6 +52,11 @@ class Cleared:
         """The name of the method, with its label if it has one."""
         return f"{self.method} ({self.label})" if self.label else self.method
 
+    @property
+    def key(self) -> str:
+        """Beginning of its metrics in a report: `clear/TABLES/METHOD`, or `clear/TABLES/LABEL/METHOD` with a label."""
+        return "/".join(filter(None, ("clear", self.tables, self.label, self.method)))
+
 
 def tables_name(cases: str, objects: str, *, packed: bool = False) -> str:
     """Return the name of a table of results: that of a case file, random-N or packed-N; `own-` sets a user's apart.

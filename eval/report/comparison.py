@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -14,8 +14,8 @@ from dipn_jax.errors import UserError
 
 from .. import drawing
 from ..clearing import film, lockstep
-from . import conditions, paper
-from .cleared import COUNTS, Cleared
+from .cleared import Cleared
+from .results import Results
 
 FRAMES = 10
 """Number of pictures in a filmstrip."""
@@ -26,8 +26,6 @@ NOTE = (
     "numbers of the paper are of its own simulator, robot and objects."
 )
 """What is said below the tables of results."""
-MEASURES = ("completion", "grasps_that_held", *paper.COLUMNS[1:])
-"""Metrics of the table of results: those of the paper, and a share that no grasp of two objects raises."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",
@@ -47,25 +45,24 @@ def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     folders: dict[str, pathlib.Path] = {}
     for one in all_cleared:
-        at = "/".join(filter(None, ("clear", one.tables, one.label, one.method)))
-        if at in folders:
+        if one.key in folders:
             raise UserError(
-                f"--clear {folders[at]} {one.folder}: both are {one.name} on {one.tables}; give one of them, or clear "
-                "again with another --label"
+                f"--clear {folders[one.key]} {one.folder}: both are {one.name} on {one.tables}; give one of them, or "
+                "clear again with another --label"
             )
-        folders[at] = one.folder
-        values |= {f"{at}/{key}": value for key, value in one.values.items()}
+        folders[one.key] = one.folder
+        values |= {f"{one.key}/{key}": value for key, value in one.values.items()}
     return values
 
 
-def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
+def section(all_results: Sequence[Results]) -> tuple[str, dict[str, Any]]:
     """Return HTML with places for figures, and the figures by name."""
     parts, figures = ["<h2>Clearing tables</h2>"], {}
-    for tables in dict.fromkeys(one.tables for one in all_cleared):
-        rows = [one for one in all_cleared if one.tables == tables]
-        results, causes = results_and_causes(rows)
-        notes = "".join(f"<p class=note>{pages.escaped(note)}</p>" for note in notes_below(rows))
-        parts.append(f"<h3>{pages.escaped(tables)}</h3>{results}{notes}")
+    for results in all_results:
+        tables, rows = results.tables, results.rows
+        notes = "".join(f"<p class=note>{pages.escaped(note)}</p>" for note in results.notes())
+        numbers, causes = results_and_causes(rows, rival=results.rival)
+        parts.append(f"<h3>{pages.escaped(tables)}</h3>{numbers}{notes}")
         parts.append(f"<p>Why tables were not cleared:</p>{causes}{{course-{tables}}}")
         figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
@@ -80,31 +77,18 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
         "<p>Pushes first: the scene with the chosen action; the image predicted for the best push, with the values "
         "compared (gamma times the mean grasp score on it, and the mean score now); the scene after.</p>{steps}"
     )
-    figures["steps"] = _steps(all_cleared)
+    figures["steps"] = _steps([one for results in all_results for one in results.rows])
     return "".join(parts), figures
 
 
-def results_and_causes(rows: list[Cleared]) -> tuple[str, str]:
-    """Return the HTML tables of results on the same tables, beside the paper's, and of why some were not cleared."""
-    return _table(rows, paper.TABLE.get(rows[0].tables, {})), _causes(rows)
+def results_and_causes(rows: Sequence[Cleared], *, rival: Cleared | None = None) -> tuple[str, str]:
+    """Return the HTML tables of results on the same tables, beside the paper's, and of why some were not cleared.
 
-
-def notes_below(rows: list[Cleared]) -> list[str]:
-    """Return what is said below a table of results: how its rows were made, and in what they differ."""
-    return conditions.notes({one.name: one.conditions for one in rows})
-
-
-def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> str:
-    head = ["", "tables", "grasps", "pushes", *[f"{measure.replace('_', ' ')} %" for measure in MEASURES]]
-    lines = []
-    for one in rows:
-        counts = [str(one.values[key]) for key in COUNTS]
-        lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in MEASURES]])
-    for method, numbers in published.items():
-        known = dict(zip(paper.COLUMNS, numbers, strict=True))
-        shares = [f"{known[key]:.1f}" if key in known else "" for key in MEASURES]
-        lines.append([f"{method}, the paper", "", "", "", *shares])
-    return pages.table(head, lines)
+    Args:
+      rows: the results, at least one.
+      rival: the one of them that the others are compared with.
+    """
+    return pages.table(*Results(rows, rival).cells()), _causes(rows)
 
 
 def _cause(one: Cleared, entry: dict[str, Any]) -> str:
@@ -114,7 +98,7 @@ def _cause(one: Cleared, entry: dict[str, Any]) -> str:
     return "thrown out" if grasped else ended
 
 
-def _causes(rows: list[Cleared]) -> str:
+def _causes(rows: Sequence[Cleared]) -> str:
     """Return an HTML table of how tables ended, and on which cases they were not cleared."""
     lines = []
     for one in rows:
@@ -135,7 +119,7 @@ def share_left(one: Cleared, at: np.ndarray) -> np.ndarray:
     return np.mean(shares, axis=0)
 
 
-def _courses(rows: list[Cleared]) -> Any:
+def _courses(rows: Sequence[Cleared]) -> Any:
     """Plot the share of objects left against the number of actions."""
     figure, axis = plt.subplots(figsize=(6, 3.5))
     at = np.linspace(0, lockstep.ACTIONS_PER_OBJECT, 61)

@@ -19,7 +19,8 @@ from dipn_jax.system import files, typed
 
 from .. import drawing, metrics
 from ..clearing import sweeping
-from . import comparison, networks
+from . import comparison, networks, results
+from .cleared import Cleared
 
 _FILMS = {
     "before": arrays.Form("fu", ("pushes", "H", "W", 3)),
@@ -41,13 +42,20 @@ class Sources:
     runs: Sequence[pathlib.Path] = ()  # of dipn-train
 
 
-def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
+def write(out: pathlib.Path, sources: Sources, *, against: str = "") -> dict[str, Any]:
     """Write `report.html`, its pictures and `metrics.json` to a folder; return the metrics of all sources.
 
+    Args:
+      out: the folder.
+      sources: what the report is made from.
+      against: the row of cleared tables that the others are compared with, as `results.grouped` takes it.
+
     Raises:
-      UserError: there are no sources, or a folder lacks what its command writes.
+      UserError: there are no sources, a folder lacks what its command writes, or no row is called `against`.
     """
-    values, parts, figures = _sections(sources)
+    if against and not sources.clears:
+        raise UserError(f"--against {against}: compares cleared tables; give their folders with --clear")
+    values, parts, figures = _sections(sources, against)
     if not parts:
         raise UserError("report: nothing to report; give --prediction, --grasp, --clear, --sweep or --runs")
     body = "".join(parts)
@@ -61,16 +69,18 @@ def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
     return values
 
 
-def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, Any]]:
+def _sections(sources: Sources, against: str) -> tuple[dict[str, Any], list[str], dict[str, Any]]:
     """Return the metrics, the sections as HTML with places for figures, and the figures by name."""
     values: dict[str, Any] = {}
     parts: list[str] = []
     figures: dict[str, Any] = {}
     try:
         if sources.clears:
-            cleared = [comparison.Cleared(folder) for folder in sources.clears]
+            cleared = [Cleared(folder) for folder in sources.clears]
             values |= comparison.flat(cleared)
-            part, more = comparison.section(cleared)
+            found = results.grouped(cleared, against=against)
+            values |= results.differences(found)
+            part, more = comparison.section(found)
             parts.append(part)
             figures |= more
         if sources.sweep:

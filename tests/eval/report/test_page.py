@@ -113,7 +113,9 @@ def test_two_folders_of_one_method_and_label_are_refused(one_table: pathlib.Path
     assert not (tmp_path / "o").exists()
     settings = files.read_json(other / "settings.json")
     files.write_json(other / "settings.json", settings | {"label": "again", "seed": 7})
-    values = page.write(tmp_path / "o", page.Sources(clears=[one_table, other]))
+    values = page.write(tmp_path / "o", page.Sources(clears=[one_table, other]), against="again")
     assert values["clear/hard/again/gn/grasps"] == values["clear/hard/gn/grasps"]
     written = (tmp_path / "o" / "report.html").read_text()
     assert "<p class=note>Rows of different tables: --seed not recorded (gn), 7 (gn (again)).</p>" in written
+    assert "points from gn (again)</th>" in written and values["clear/hard/gn/efficiency_all_difference"] is None
+    assert files.read_json(tmp_path / "o" / "metrics.json") == values
