@@ -27,7 +27,7 @@ def report(
       dipn-eval report --clear results/dipn+gn results/gn --against gn --out results
 
     Args:
-      out: folder for report.html and metrics.json.
+      out: folder for report.html and metrics.json; of cleared tables table.md and table.csv, too.
       predictions: --out of dipn-eval prediction.
       grasps: --out of dipn-eval grasp.
       clears: --out of any number of dipn-eval clear: methods and tables side by side, beside the paper's numbers.
@@ -41,4 +41,5 @@ def report(
 
     sources = page.Sources(prediction=predictions, grasp=grasps, clears=clears, sweep=sweeps, runs=runs)
     values = page.write(out, sources, against=against)
-    console.say(f"{out / 'report.html'}: {len(values)} numbers, also in {out / 'metrics.json'}")
+    tables = f"; the tables of results in {out / 'table.md'} and {out / 'table.csv'}" if clears else ""
+    console.say(f"{out / 'report.html'}: {len(values)} numbers, also in {out / 'metrics.json'}{tables}")

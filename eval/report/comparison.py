@@ -15,17 +15,12 @@ from dipn_jax.errors import UserError
 from .. import drawing
 from ..clearing import film, lockstep
 from .cleared import Cleared
-from .results import Results
+from .results import NOTE, Results
 
 FRAMES = 10
 """Number of pictures in a filmstrip."""
 FILM_ROWS = 4
 """Number of steps in the figure of predictions."""
-NOTE = (
-    "Per cent, with bootstrap 95 % intervals over cases, then over their repeats (random tables: over tables); the "
-    "numbers of the paper are of its own simulator, robot and objects."
-)
-"""What is said below the tables of results."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",

@@ -19,7 +19,7 @@ from dipn_jax.system import files, typed
 
 from .. import drawing, metrics
 from ..clearing import sweeping
-from . import comparison, networks, results
+from . import comparison, networks, results, tabular
 from .cleared import Cleared
 
 _FILMS = {
@@ -45,6 +45,8 @@ class Sources:
 def write(out: pathlib.Path, sources: Sources, *, against: str = "") -> dict[str, Any]:
     """Write `report.html`, its pictures and `metrics.json` to a folder; return the metrics of all sources.
 
+    Where tables were cleared, their results are in `table.md` and `table.csv`, too.
+
     Args:
       out: the folder.
       sources: what the report is made from.
@@ -55,7 +57,7 @@ def write(out: pathlib.Path, sources: Sources, *, against: str = "") -> dict[str
     """
     if against and not sources.clears:
         raise UserError(f"--against {against}: compares cleared tables; give their folders with --clear")
-    values, parts, figures = _sections(sources, against)
+    values, parts, figures, texts = _sections(sources, against)
     if not parts:
         raise UserError("report: nothing to report; give --prediction, --grasp, --clear, --sweep or --runs")
     body = "".join(parts)
@@ -65,15 +67,18 @@ def write(out: pathlib.Path, sources: Sources, *, against: str = "") -> dict[str
     body = f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {pages.escaped(versions)}.</p>'
     page = pages.standalone_page("dipn-jax report", body)
     files.write_text(out / "report.html", page)
+    for name, text in texts.items():
+        files.write_text(out / name, text)
     files.write_json(out / "metrics.json", values)
     return values
 
 
-def _sections(sources: Sources, against: str) -> tuple[dict[str, Any], list[str], dict[str, Any]]:
-    """Return the metrics, the sections as HTML with places for figures, and the figures by name."""
+def _sections(sources: Sources, against: str) -> tuple[dict[str, Any], list[str], dict[str, Any], dict[str, str]]:
+    """Return the metrics, the sections as HTML with places for figures, and by name the figures and other files."""
     values: dict[str, Any] = {}
     parts: list[str] = []
     figures: dict[str, Any] = {}
+    texts: dict[str, str] = {}
     try:
         if sources.clears:
             cleared = [Cleared(folder) for folder in sources.clears]
@@ -83,6 +88,7 @@ def _sections(sources: Sources, against: str) -> tuple[dict[str, Any], list[str]
             part, more = comparison.section(found)
             parts.append(part)
             figures |= more
+            texts = {"table.md": tabular.as_markdown(found), "table.csv": tabular.as_csv(found)}
         if sources.sweep:
             values |= metrics.read(sources.sweep)
             figures["sweep"] = sweeping.figure(values)
@@ -103,7 +109,7 @@ def _sections(sources: Sources, against: str) -> tuple[dict[str, Any], list[str]
         raise UserError(
             f"report: a folder lacks {typed.brief(str(error))}; give the folders that dipn-eval wrote"
         ) from None
-    return values, parts, figures
+    return values, parts, figures, texts
 
 
 def _evaluated(sources: Sources) -> dict[pathlib.Path, str]:

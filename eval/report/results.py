@@ -22,6 +22,13 @@ COMPARED = "efficiency_all"
 DIFFERENCE = f"{COMPARED}_difference"
 """Name of its difference."""
 
+ENDS = ("", "_low", "_high")
+"""Ends of the names of a metric and of its interval."""
+NOTE = (
+    "Per cent, with bootstrap 95 % intervals over cases, then over their repeats (random tables: over tables); the "
+    "numbers of the paper are of its own simulator, robot and objects."
+)
+"""What is said below the tables of results."""
 Difference = tuple[float, float, float]
 """A difference of two shares, and the ends of its interval."""
 
@@ -63,6 +70,16 @@ class Results:
                 low, high = interval if len(cases) > 1 else (float("nan"), float("nan"))
                 found[one.name] = (value, low, high)
         return found
+
+    def difference_of(self, one: Cleared) -> dict[str, float | None]:
+        """Return a row's difference from the rival as metrics, None where nothing is known; empty for the rival."""
+        if one.name not in self.differences:
+            return {}
+        parts = self.differences[one.name] or (None, None, None)
+        return {
+            f"{DIFFERENCE}{end}": value if value is not None and np.isfinite(value) else None
+            for end, value in zip(ENDS, parts, strict=True)
+        }
 
     def cells(self) -> tuple[list[str], list[list[str]]]:
         """Return the titles of the columns and the cells of the rows, as text, per cent."""
@@ -136,15 +153,13 @@ def _paired(one: Cleared, other: Cleared) -> bool:
 
 
 def differences(found: Sequence[Results]) -> dict[str, float | None]:
-    """Return the differences from the rivals as metrics; None where a row is of other tables, or nothing is known."""
-    values: dict[str, float | None] = {}
-    for each in found:
-        for one in each.rows:
-            if one.name in each.differences:
-                parts = each.differences[one.name] or (None, None, None)
-                for end, value in zip(("", "_low", "_high"), parts, strict=True):
-                    values[f"{one.key}/{DIFFERENCE}{end}"] = value if value is not None and np.isfinite(value) else None
-    return values
+    """Return the differences from the rivals as metrics of a report."""
+    return {
+        f"{one.key}/{name}": value
+        for each in found
+        for one in each.rows
+        for name, value in each.difference_of(one).items()
+    }
 
 
 def _removed_and_actions(one: Cleared) -> tuple[Any, Any]:

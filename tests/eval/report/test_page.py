@@ -119,3 +119,5 @@ def test_two_folders_of_one_method_and_label_are_refused(one_table: pathlib.Path
     assert "<p class=note>Rows of different tables: --seed not recorded (gn), 7 (gn (again)).</p>" in written
     assert "points from gn (again)</th>" in written and values["clear/hard/gn/efficiency_all_difference"] is None
     assert files.read_json(tmp_path / "o" / "metrics.json") == values
+    assert (tmp_path / "o" / "table.md").read_text().count("| gn (again) |") == 1
+    assert (tmp_path / "o" / "table.csv").read_text().count("here,hard,gn,again,") == 1
