@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -11,18 +11,16 @@ import numpy as np
 
 from dipn_jax.commands import pages
 from dipn_jax.errors import UserError
-from dipn_jax.system import files, typed
 
 from .. import drawing
-from ..clearing import film, lockstep, merging
-from . import paper
+from ..clearing import film, lockstep
+from .cleared import Cleared
+from .results import NOTE, Results
 
 FRAMES = 10
 """Number of pictures in a filmstrip."""
 FILM_ROWS = 4
 """Number of steps in the figure of predictions."""
-COUNTS = ("instances", "grasps", "pushes")
-"""Metrics that are numbers of something."""
 CAUSES = {
     "cleared": "cleared",
     "pushed out": "pushed out of the workspace",
@@ -31,44 +29,6 @@ CAUSES = {
     "fault": "the simulation went wrong",
 }
 """How a table can end, and how the report says it."""
-
-
-_SETTINGS = {"method": str, "label": str, "tables.cases": str, "tables.objects": object}
-"""Form of `settings.json`."""
-_EPISODE = {name: form for name, form in merging.EPISODE.items() if name != "held"}
-"""What a report reads of an entry of `episodes.json`."""
-
-
-class Cleared:
-    """The results in the folder of a `dipn-eval clear`."""
-
-    def __init__(self, folder: pathlib.Path) -> None:
-        self.folder = folder
-        self.values = files.read_json(folder / "metrics.json", wanted={str: typed.Maybe(float)})
-        files.read_json(folder / "metrics.json", wanted=dict.fromkeys(COUNTS, typed.Whole()))
-        settings = files.read_json(folder / "settings.json", wanted=_SETTINGS)
-        self.method, self.label = settings["method"], settings["label"]
-        cases = settings["tables.cases"]
-        self.tables = _tables_name(cases, settings["tables.objects"])
-        self.episodes = files.read_json(folder / "episodes.json", wanted=[_EPISODE])
-        if not self.episodes:
-            raise UserError(f"{folder / 'episodes.json'}: lists no table; give a folder that dipn-eval clear wrote")
-
-    def film(self, entry: dict[str, Any]) -> film.Film:
-        """Return the film of a table that is listed.
-
-        Raises:
-          UserError: it is damaged, or listed under a name that leads out of the folder.
-        """
-        try:
-            return film.load(typed.inside(self.folder, entry["file"]))
-        except typed.Misfit as error:
-            raise UserError(f"{self.folder / 'episodes.json'}: {error}; clear the tables again") from None
-
-    @property
-    def name(self) -> str:
-        """The name of the method, with its label if it has one."""
-        return f"{self.method} ({self.label})" if self.label else self.method
 
 
 def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
@@ -80,24 +40,24 @@ def flat(all_cleared: list[Cleared]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     folders: dict[str, pathlib.Path] = {}
     for one in all_cleared:
-        at = "/".join(filter(None, ("clear", one.tables, one.label, one.method)))
-        if at in folders:
+        if one.key in folders:
             raise UserError(
-                f"--clear {folders[at]} {one.folder}: both are {one.name} on {one.tables}; give one of them, or clear "
-                "again with another --label"
+                f"--clear {folders[one.key]} {one.folder}: both are {one.name} on {one.tables}; give one of them, or "
+                "clear again with another --label"
             )
-        folders[at] = one.folder
-        values |= {f"{at}/{key}": value for key, value in one.values.items()}
+        folders[one.key] = one.folder
+        values |= {f"{one.key}/{key}": value for key, value in one.values.items()}
     return values
 
 
-def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
+def section(all_results: Sequence[Results]) -> tuple[str, dict[str, Any]]:
     """Return HTML with places for figures, and the figures by name."""
     parts, figures = ["<h2>Clearing tables</h2>"], {}
-    for tables in dict.fromkeys(one.tables for one in all_cleared):
-        rows = [one for one in all_cleared if one.tables == tables]
-        results, causes = results_and_causes(rows)
-        parts.append(f"<h3>{pages.escaped(tables)}</h3>{results}")
+    for results in all_results:
+        tables, rows = results.tables, results.rows
+        notes = "".join(f"<p class=note>{pages.escaped(note)}</p>" for note in results.notes())
+        numbers, causes = results_and_causes(rows, rival=results.rival)
+        parts.append(f"<h3>{pages.escaped(tables)}</h3>{numbers}{notes}")
         parts.append(f"<p>Why tables were not cleared:</p>{causes}{{course-{tables}}}")
         figures[f"course-{tables}"] = _courses(rows)
         for number, one in enumerate(rows):
@@ -108,29 +68,22 @@ def section(all_cleared: list[Cleared]) -> tuple[str, dict[str, Any]]:
                 f"the best, the median and the worst table</h4>{{{place}}}"
             )
     parts.append(
-        "<p class=note>Per cent, with bootstrap 95 % intervals over tables; the numbers of the paper are of its own "
-        "simulator, robot and objects.</p><h2>What was seen, chosen, imagined, and what happened</h2>"
+        f"<p class=note>{NOTE}</p><h2>What was seen, chosen, imagined, and what happened</h2>"
         "<p>Pushes first: the scene with the chosen action; the image predicted for the best push, with the values "
         "compared (gamma times the mean grasp score on it, and the mean score now); the scene after.</p>{steps}"
     )
-    figures["steps"] = _steps(all_cleared)
+    figures["steps"] = _steps([one for results in all_results for one in results.rows])
     return "".join(parts), figures
 
 
-def results_and_causes(rows: list[Cleared]) -> tuple[str, str]:
-    """Return the HTML tables of results on the same tables, beside the paper's, and of why some were not cleared."""
-    return _table(rows, paper.TABLE.get(rows[0].tables, {})), _causes(rows)
+def results_and_causes(rows: Sequence[Cleared], *, rival: Cleared | None = None) -> tuple[str, str]:
+    """Return the HTML tables of results on the same tables, beside the paper's, and of why some were not cleared.
 
-
-def _table(rows: list[Cleared], published: Mapping[str, tuple[float, ...]]) -> str:
-    head = ["", "tables", "grasps", "pushes", *[f"{column.replace('_', ' ')} %" for column in paper.COLUMNS]]
-    lines = []
-    for one in rows:
-        counts = [str(one.values[key]) for key in COUNTS]
-        lines.append([one.name, *counts, *[drawing.percent(one.values, key) for key in paper.COLUMNS]])
-    for method, numbers in published.items():
-        lines.append([f"{method}, the paper", "", "", "", *[f"{number:.1f}" for number in numbers]])
-    return pages.table(head, lines)
+    Args:
+      rows: the results, at least one.
+      rival: the one of them that the others are compared with.
+    """
+    return pages.table(*Results(rows, rival).cells()), _causes(rows)
 
 
 def _cause(one: Cleared, entry: dict[str, Any]) -> str:
@@ -140,15 +93,7 @@ def _cause(one: Cleared, entry: dict[str, Any]) -> str:
     return "thrown out" if grasped else ended
 
 
-def _tables_name(cases: str, objects: str) -> str:
-    """Return the name of a table of results: the hard instances, random-N, or a case file of the user's own."""
-    if cases in ("hard", "random"):
-        return cases if cases == "hard" else f"random-{objects}"
-    stem = pathlib.Path(cases).stem
-    return f"own-{stem}" if stem in paper.TABLE else stem
-
-
-def _causes(rows: list[Cleared]) -> str:
+def _causes(rows: Sequence[Cleared]) -> str:
     """Return an HTML table of how tables ended, and on which cases they were not cleared."""
     lines = []
     for one in rows:
@@ -169,7 +114,7 @@ def share_left(one: Cleared, at: np.ndarray) -> np.ndarray:
     return np.mean(shares, axis=0)
 
 
-def _courses(rows: list[Cleared]) -> Any:
+def _courses(rows: Sequence[Cleared]) -> Any:
     """Plot the share of objects left against the number of actions."""
     figure, axis = plt.subplots(figsize=(6, 3.5))
     at = np.linspace(0, lockstep.ACTIONS_PER_OBJECT, 61)

@@ -19,7 +19,8 @@ from dipn_jax.system import files, typed
 
 from .. import drawing, metrics
 from ..clearing import sweeping
-from . import comparison, networks
+from . import comparison, networks, results, tabular
+from .cleared import Cleared
 
 _FILMS = {
     "before": arrays.Form("fu", ("pushes", "H", "W", 3)),
@@ -41,13 +42,22 @@ class Sources:
     runs: Sequence[pathlib.Path] = ()  # of dipn-train
 
 
-def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
+def write(out: pathlib.Path, sources: Sources, *, against: str = "") -> dict[str, Any]:
     """Write `report.html`, its pictures and `metrics.json` to a folder; return the metrics of all sources.
 
+    Where tables were cleared, their results are in `table.md` and `table.csv`, too.
+
+    Args:
+      out: the folder.
+      sources: what the report is made from.
+      against: the row of cleared tables that the others are compared with, as `results.grouped` takes it.
+
     Raises:
-      UserError: there are no sources, or a folder lacks what its command writes.
+      UserError: there are no sources, a folder lacks what its command writes, or no row is called `against`.
     """
-    values, parts, figures = _sections(sources)
+    if against and not sources.clears:
+        raise UserError(f"--against {against}: compares cleared tables; give their folders with --clear")
+    values, parts, figures, texts = _sections(sources, against)
     if not parts:
         raise UserError("report: nothing to report; give --prediction, --grasp, --clear, --sweep or --runs")
     body = "".join(parts)
@@ -57,22 +67,28 @@ def write(out: pathlib.Path, sources: Sources) -> dict[str, Any]:
     body = f'<h1>Push or grasp?</h1>{body}<p class="note">Made with {pages.escaped(versions)}.</p>'
     page = pages.standalone_page("dipn-jax report", body)
     files.write_text(out / "report.html", page)
+    for name, text in texts.items():
+        files.write_text(out / name, text)
     files.write_json(out / "metrics.json", values)
     return values
 
 
-def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, Any]]:
-    """Return the metrics, the sections as HTML with places for figures, and the figures by name."""
+def _sections(sources: Sources, against: str) -> tuple[dict[str, Any], list[str], dict[str, Any], dict[str, str]]:
+    """Return the metrics, the sections as HTML with places for figures, and by name the figures and other files."""
     values: dict[str, Any] = {}
     parts: list[str] = []
     figures: dict[str, Any] = {}
+    texts: dict[str, str] = {}
     try:
         if sources.clears:
-            cleared = [comparison.Cleared(folder) for folder in sources.clears]
+            cleared = [Cleared(folder) for folder in sources.clears]
             values |= comparison.flat(cleared)
-            part, more = comparison.section(cleared)
+            found = results.grouped(cleared, against=against)
+            values |= results.differences(found)
+            part, more = comparison.section(found)
             parts.append(part)
             figures |= more
+            texts = {"table.md": tabular.as_markdown(found), "table.csv": tabular.as_csv(found)}
         if sources.sweep:
             values |= metrics.read(sources.sweep)
             figures["sweep"] = sweeping.figure(values)
@@ -93,7 +109,7 @@ def _sections(sources: Sources) -> tuple[dict[str, Any], list[str], dict[str, An
         raise UserError(
             f"report: a folder lacks {typed.brief(str(error))}; give the folders that dipn-eval wrote"
         ) from None
-    return values, parts, figures
+    return values, parts, figures, texts
 
 
 def _evaluated(sources: Sources) -> dict[pathlib.Path, str]:

@@ -1,29 +1,14 @@
 import pathlib
+import re
 from typing import Any
 
 import numpy as np
 import pytest
-from dipn_jax.eval.clearing import film
 from dipn_jax.eval.report import comparison
 
 from dipn_jax.errors import UserError
 from dipn_jax.system import files
 from experiments.fuzz_parsers import PARSERS
-
-
-@pytest.mark.slow
-def test_a_table_is_lost_to_a_push_or_to_a_grasp(cleared: Any, tmp_path: pathlib.Path) -> None:
-    _, out = cleared
-    one = comparison.Cleared(out)
-    entry = one.episodes[0]
-    last = film.load(out / entry["file"]).what[-1]
-    assert comparison._cause(one, entry | {"ended": "out of actions"}) == "out of actions"
-    lost = comparison._cause(one, entry | {"ended": "pushed out"})
-    assert lost == ("pushed out" if last == "push" else "thrown out") and set(comparison.CAUSES) >= {lost}
-    assert comparison._tables_name("hard", "10") == "hard" and comparison._tables_name("random", "30") == "random-30"
-    assert (
-        comparison._tables_name("my/hard.json", "10") == "own-hard" and comparison._tables_name("my/a.json", "") == "a"
-    )
 
 
 @pytest.mark.slow
@@ -46,3 +31,21 @@ def test_metrics_that_are_no_numbers_are_one_line(tmp_path: pathlib.Path) -> Non
         files.write_json(tmp_path / "metrics.json", values | wrong)
         with pytest.raises(UserError, match=rf"metrics\.json: damaged, {next(iter(wrong))} is"):
             comparison.Cleared(tmp_path)
+
+
+def test_the_table_has_the_measures_of_the_first_page_and_the_paper_those_that_it_reports(
+    tmp_path: pathlib.Path,
+) -> None:
+    PARSERS["film"].prepare(tmp_path)
+    values = files.read_json(tmp_path / "metrics.json")
+    files.write_json(tmp_path / "metrics.json", values | {"grasps_that_held": 0.125})
+    results, _ = comparison.results_and_causes([comparison.Cleared(tmp_path)])
+    head, row, *others = [re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in results.split("<tr>")[1:]]
+    ours = dict(zip(head, row, strict=True))
+    assert ours["grasps that held %"].startswith("12.5 [") and ours["efficiency all %"].startswith("150.0 [")
+    theirs = {line[0]: dict(zip(head, line, strict=True)) for line in others}["dipn+gn, the paper"]
+    assert (theirs["grasps that held %"], theirs["grasp success all %"], theirs["efficiency all %"]) == (
+        "",
+        "93.3",
+        "74.4",
+    )

@@ -102,6 +102,7 @@ def test_what_users_named_is_text_in_pages_and_figures(
     ours = {"html", "meta", "title", "style", "h1", "h2", "h3", "h4", "p", "table", "tr", "th", "td", "img"}
     assert tags.found == ours, "none of them comes from a name"
     assert "<h2>Networks</h2><table>" in text
+    assert "intervals over cases, then over their repeats" in text, "as lockstep.summary computes them"
     assert text.count("data:image/png;base64,") == 4, "each figure stands in its place, once"
 
 
@@ -111,6 +112,12 @@ def test_two_folders_of_one_method_and_label_are_refused(one_table: pathlib.Path
         page.write(tmp_path / "o", page.Sources(clears=[one_table, other]))
     assert not (tmp_path / "o").exists()
     settings = files.read_json(other / "settings.json")
-    files.write_json(other / "settings.json", settings | {"label": "again"})
-    values = page.write(tmp_path / "o", page.Sources(clears=[one_table, other]))
+    files.write_json(other / "settings.json", settings | {"label": "again", "seed": 7})
+    values = page.write(tmp_path / "o", page.Sources(clears=[one_table, other]), against="again")
     assert values["clear/hard/again/gn/grasps"] == values["clear/hard/gn/grasps"]
+    written = (tmp_path / "o" / "report.html").read_text()
+    assert "<p class=note>Rows of different tables: --seed not recorded (gn), 7 (gn (again)).</p>" in written
+    assert "points from gn (again)</th>" in written and values["clear/hard/gn/efficiency_all_difference"] is None
+    assert files.read_json(tmp_path / "o" / "metrics.json") == values
+    assert (tmp_path / "o" / "table.md").read_text().count("| gn (again) |") == 1
+    assert (tmp_path / "o" / "table.csv").read_text().count("here,hard,gn,again,") == 1
