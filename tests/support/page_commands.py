@@ -39,6 +39,8 @@ ALWAYS = {
     ("dipn-eval", "grasp"): ("--scenes", "2"),
 }  # fmt: skip
 """Options that the tests add to a command which does not have them."""
+ONE_CASE = {"hard": "06", "heldout": "vft01"}
+"""The only case of a file that the tests clear."""
 STAND_INS = {
     "data/push": "push", "data/grasp": "grasp", "data/images": "images", "data/million": "push", "disk1/push": "push",
     "bucket/million": "push", "runs/dipn": "dipn", "runs/gn": "gn", "results/push/runs/51000-0": "dipn",
@@ -75,8 +77,9 @@ def smaller(words: list[str]) -> list[str]:
         by_option.setdefault(name, [value])
     if "--curve" in by_option:
         by_option["--curve"] = [each for pattern in by_option["--curve"] for each in sorted(glob.glob(pattern))]
-    if clearing and by_option.get("--cases", ["hard"]) in (["hard"], ["heldout"]):
-        by_option.setdefault("--names", ["06"])
+    cases = " ".join(by_option.get("--cases", ["hard"]))
+    if clearing and cases in ONE_CASE:
+        by_option.setdefault("--names", [ONE_CASE[cases]])
     return [*words[:2], *(word for name, values in by_option.items() for word in (name, *values) if word)]
 
 
