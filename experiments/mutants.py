@@ -54,6 +54,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "eval/clearing/tables.py": ("tests/eval/clearing/test_command.py",),
     "eval/clearing/on_tables.py": ("tests/eval/clearing/test_command.py",),
     "eval/report/comparison.py": ("tests/eval/report/test_comparison.py", "tests/eval/report/test_causes.py"),
+    "eval/report/results.py": ("tests/eval/report/test_results.py",),
     "experiments/clearing_numbers.py": ("tests/experiments/test_kept_results.py",),
 }
 """Module that computes a number in a table -> the tests that its mutants are held against, the fastest first."""
