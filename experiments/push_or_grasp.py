@@ -73,10 +73,10 @@ def compare(engine: Engine, tables: Tables, out: pathlib.Path) -> list[dict[str,
     (grasps,) = on_tables.load("gn", networks, engine, [PolicyConfig()], camera=DEFAULT_CAMERA)
     (push,) = on_tables.load("dipn+gn", networks, engine, [PUSHED], camera=DEFAULT_CAMERA)
     made = tables.make(engine, seed=SEED)
-    alone = lockstep.clear(made, engine, grasps, Partial(out, {"what": "grasps"}), seed=SEED)
+    alone = lockstep.clear(made, engine, grasps, Partial(out / "grasps", {}), seed=SEED)
     states = [(table, step) for table in alone if (step := _first_unsure(table)) is not None]
     begun = [_at(table, step) for table, step in states]
-    pushed = lockstep.clear(begun, engine, PushFirst(push, grasps), Partial(out, {"what": "push"}), seed=SEED)
+    pushed = lockstep.clear(begun, engine, PushFirst(push, grasps), Partial(out / "push", {}), seed=SEED)
     short = _shortfalls([(table, step) for table, step in states])
     return [_row(table, step, after, lack) for (table, step), after, lack in zip(states, pushed, short, strict=True)]
 
