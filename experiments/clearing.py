@@ -41,8 +41,10 @@ PAPER = {"gn": 500, "dipn": 1500, "rea": 1500, "rea-dipn": 2000, "dqn": 1500, "v
 """Samples of each network, as many as the paper gives it."""
 LARGE = {"gn": 5000, "dipn": 5000, "rea": 5000, "rea-dipn": 5000, "dqn": 5000, "vpg": 10_000}
 """Samples of each network where all methods have 10,000 in all."""
-BUDGETS = {"paper": (PAPER, 3), "large": (LARGE, 2)}
-"""Samples, and number of trainings."""
+BUDGETS = {"paper": (PAPER, 3, 3000), "large": (LARGE, 2, 10_000)}
+"""Samples, number of trainings, and steps of a DIPN: two a push, as those that learn online take two an action (but 1.5
+for the 2,000 pushes of REA+DIPN with *paper*).
+"""
 
 NOISE = {
     "height-1mm": "--height-noise 0.001",
@@ -73,10 +75,11 @@ def list_runs(root: pathlib.Path) -> list[Run]:
     _shipped(run)
     _details(run)
     pushes = run("pushes", "dipn-datagen push --episodes 5600")
-    pretrained = run.borrow(grasping.list_runs(root), "pretrained", prefix="grasp")
-    for budget, (samples, trainings) in BUDGETS.items():
+    learnt_from = [(pushes, run.borrow(grasping.list_runs(root), "pretrained", prefix="grasp"))]
+    learnt_from += [_own_data(run, seed) for seed in range(1, max(number for _, number, _ in BUDGETS.values()))]
+    for budget, (_, trainings, _) in BUDGETS.items():
         for seed in range(trainings):
-            methods = _train(run, budget, samples, seed, pushes, pretrained)
+            methods = _train(run, budget, seed, *learnt_from[seed])
             on_all = TABLES if seed == 0 else {on: TABLES[on] for on in ("hard", "heldout")}
             for aids, extra in AIDS.items():
                 for on, which in on_all.items():
@@ -91,13 +94,21 @@ def list_runs(root: pathlib.Path) -> list[Run]:
     return run.runs
 
 
+def _own_data(run: Recipe, seed: int) -> tuple[pathlib.Path, pathlib.Path]:
+    """Add pushes and a pre-training of their own for one seed, as the learners that act have their own tables."""
+    at, seeded = f"data/{seed}", f"--seed {seed}"
+    pushes = run(f"{at}/pushes", "dipn-datagen push --episodes 5600", seeded)
+    images = run(f"{at}/images", "dipn-datagen images --episodes 100", seeded)
+    return pushes, run(f"{at}/pretrained", "dipn-train grasp-pretrain --steps 400", seeded, "--data", images)
+
+
 def _train(
-    run: Recipe, budget: str, samples: dict[str, int], seed: int, pushes: pathlib.Path, pretrained: pathlib.Path
+    run: Recipe, budget: str, seed: int, pushes: pathlib.Path, pretrained: pathlib.Path
 ) -> dict[str, tuple[Part, ...]]:
     """Add one training of every network; return the options of the methods that decide with them."""
-    at, seeded = f"{budget}/{seed}", f"--seed {seed}"
+    samples, _, steps = BUDGETS[budget]
+    at, seeded, learnt = f"{budget}/{seed}", f"--seed {seed}", f"dipn-train push --steps {steps}"
     gn = run(f"{at}/gn", f"dipn-train grasp-online --grasps {samples['gn']}", seeded, "--init", pretrained)
-    learnt = "dipn-train push --steps 3000"
     dipn = run(f"{at}/dipn", f"{learnt} --limit {samples['dipn']}", seeded, "--data", pushes)
     if samples["rea-dipn"] == samples["dipn"]:
         other = dipn
@@ -123,8 +134,7 @@ def _train_without_arches(run: Recipe, pushes: pathlib.Path) -> dict[str, tuple[
     images = run("unseen/images", "dipn-datagen images --episodes 100", others)
     pretrained = run("unseen/pretrained", "dipn-train grasp-pretrain --steps 400 --data", images)
     gn = run("unseen/gn", f"dipn-train grasp-online --grasps {PAPER['gn']}", others, "--init", pretrained)
-    learnt = f"dipn-train push --steps 3000 --limit {PAPER['dipn']} --without concave --data"
-    dipn = run("unseen/dipn", learnt, pushes)
+    dipn = run("unseen/dipn", f"dipn-train push --steps 3000 --limit {PAPER['dipn']} --without concave --data", pushes)
     act = f"dipn-train baseline --method dqn --actions {PAPER['dqn']}"
     dqn = run("unseen/dqn", act, others, "--grasp-net", gn)
     return {

@@ -148,7 +148,9 @@ def table(states: dict[str, Any]) -> str:
     for ratio in (1 / 0.9, 2.0, 3.0, 4.0):
         cells = [_saved([row for row in found if (row["mean_ratio"] or 0) > ratio]) for found in rows.values()]
         lines.append([f"mean score rises by a factor over {ratio:.2f}", *cells])
-    return markdown.table(["pushed where", *(f"{name}: pushes; saved; only with, only without" for name in rows)], lines)
+    return markdown.table(
+        ["pushed where", *(f"{name}: pushes; saved; only with, only without" for name in rows)], lines
+    )
 
 
 def _saved(rows: Sequence[dict[str, Any]]) -> str:
