@@ -233,14 +233,19 @@ def test_a_call_is_the_first_of_its_name(kernel: Program, recorded: Recorded) ->
     assert f"@tick_{SLOTS + 1}_80_{SUBSTEPS}_50_50_0(" in text and "launch_id = 0 " in text, text
 
 
-def test_contacts_that_are_left_out_are_a_fault_of_their_own_scene() -> None:
+def test_contacts_that_are_left_out_and_what_is_not_finite_are_faults_of_their_own_scene() -> None:
     size, flat = np.full((2, 1, 3), 0.05, np.float32), np.full((2, 1), 0.35, np.float32)
     box = Scene(np.zeros((2, 1), np.int32), size, size, flat, flat)
     pose = np.array([[[0, 0, 0.0249, 1, 0, 0, 0]], [[0, 0, 0.2, 1, 0, 0, 0]]], np.float32)
     for most, wanted in ((4, True), (5, False)):
         config = dataclasses.replace(mjx.DEFAULTS, solver="warp", contact_points=(most, 0))
-        rollout = primitives.settle(mjx.MjxEngine(config), box, pose, duration=0.01)
+        engine = mjx.MjxEngine(config)
+        rollout = primitives.settle(engine, box, pose, duration=0.01)
         assert ((rollout.fault & Fault.CAPACITY) > 0).tolist() == [wanted, False]
+    pose[0, 0, 2] = np.nan
+    broken = primitives.settle(engine, box, pose, duration=0.01)
+    assert ((broken.fault & Fault.NON_FINITE) > 0).tolist() == [True, False]
+    np.testing.assert_array_equal(broken.poses[1], rollout.poses[1])
 
 
 def test_without_warp_it_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
