@@ -36,7 +36,7 @@ BENCHMARKS = {
         "cost of a scene's step at batch 128 over that at batch 16", "<= 1.0", "datagen_mjx:batch_scaling"
     ),
     "datagen_mjx.kernel": Benchmark(
-        "seconds of the MJX engine over those with its solver and its collision as Warp kernels, and of a scene's step",
+        "seconds of MJX, and of MuJoCo C on a core, over those of MJX's Warp kernel; and of a scene's step",
         "none",
         "datagen_mjx:kernel",
     ),

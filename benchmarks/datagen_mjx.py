@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import importlib.util
 from collections.abc import Callable, Iterator
 from typing import Any
-from unittest import mock
 from xml.etree import ElementTree
 
 import jax
@@ -19,10 +17,11 @@ from mujoco import mjx
 
 from benchmarks.harness import Setting, Skipped, alternate
 from dipn_jax import geometry, structs
-from dipn_jax.engine import PhysicsConfig
+from dipn_jax.engine import Engine, PhysicsConfig
 from dipn_jax.names import EngineName
-from dipn_jax.physics import colliders, make_engine, narrow, substeps
+from dipn_jax.physics import make_engine, substeps
 from dipn_jax.physics.mjx import MjxEngine
+from dipn_jax.physics.native import NativeEngine
 from dipn_jax.structs import Scene
 from dipn_jax.world import model, primitives, scenes
 from dipn_jax.world.model import GRIPPER_DOF
@@ -100,14 +99,7 @@ class PlainLoop:
         return self.last
 
 
-@contextlib.contextmanager
-def xla_collision() -> Iterator[None]:
-    """Let programs of `mjx_warp` that are traced meanwhile find contacts by XLA; their solver is the kernel."""
-    with mock.patch.object(narrow, "collide", colliders.collide):
-        yield
-
-
-def ours(scene: Scene, poses: np.ndarray, duration: float, *, by: MjxEngine | None = None) -> Callable[[], Any]:
+def ours(scene: Scene, poses: np.ndarray, duration: float, *, by: Engine | None = None) -> Callable[[], Any]:
     """Return work for the clock: the program of an engine, `mjx` if none is given, for `duration` seconds."""
     still, end = primitives.parked_trajectory(len(poses), duration), np.array([duration])
     return lambda: (by or engine()).simulate(scene, poses, still, end)
@@ -140,23 +132,23 @@ def batch_scaling(setting: Setting) -> Iterator[tuple[str, float]]:
 
 
 def kernel(setting: Setting) -> Iterator[tuple[str, float]]:
-    """Measure seconds of the engine over those with its Warp kernels, of each kernel, and of a scene's step."""
+    """Measure seconds of the engine, and of MuJoCo C on one core, over those of the Warp kernel, and of a scene's step.
+
+    All make the same time steps of the same scenes.
+    """
     if importlib.util.find_spec("warp") is None:
         raise Skipped("datagen_mjx.kernel: warp is not installed; want pip install '.[warp]'")
     duration, batch = setting.pick(10, 30) / 100, 32 if jax.default_backend() == "cpu" else 1024
     steps = batch * round(duration / 0.01) * substeps(engine().config)
     scene, poses = heaps(setting.seed, batch)
-    solver = make_engine("mjx_warp")
-    assert isinstance(solver, MjxEngine)
-    plain, solving, both = (ours(scene, poses, duration, by=by) for by in (None, solver, engine("mjx_warp")))
-    with xla_collision():
-        solving()  # compiles, and so do the next two
-    plain(), both()
+    core = NativeEngine(engine().config, threads=1)
+    plain, kernels, native = (ours(scene, poses, duration, by=by) for by in (None, engine("mjx_warp"), core))
+    plain(), kernels()  # compile
     repeats = setting.pick(5, 7)
-    theirs, mine = alternate(plain, both, repeats=repeats)
+    theirs, mine = alternate(plain, kernels, repeats=repeats)
     yield f"datagen_mjx.kernel/{batch}", theirs / mine
     yield "datagen_mjx.kernel/milliseconds", 1000 * mine / steps
     yield "datagen_mjx.kernel/milliseconds_without", 1000 * theirs / steps
-    theirs, mine = alternate(solving, both, repeats=repeats)
-    yield "datagen_mjx.kernel/collision", theirs / mine
-    yield "datagen_mjx.kernel/milliseconds_xla_collision", 1000 * theirs / steps
+    theirs, mine = alternate(native, kernels, repeats=repeats)
+    yield "datagen_mjx.kernel/native_core", theirs / mine
+    yield "datagen_mjx.kernel/milliseconds_native_core", 1000 * theirs / steps

@@ -16,6 +16,7 @@ from benchmarks.gpu_engines import engine, make_ready
 from benchmarks.gpu_stage import NotMeasured, Size, Wrong, installed
 from dipn_jax import structs
 from dipn_jax.engine import Engine
+from dipn_jax.names import EngineName
 from dipn_jax.planning import methods
 from dipn_jax.planning.planner import NONE_MISSED
 from dipn_jax.planning.policy_config import PolicyConfig
@@ -26,7 +27,7 @@ LEAST_EQUAL = 0.95
 """Share of grasps that end as in MuJoCo C, below which an engine is wrong."""
 REPEATED_SECONDS = 0.5
 """Seconds that are simulated twice."""
-Found = Iterator[tuple[str, float]]
+Found = Iterator[tuple[str, float | str]]
 
 
 @functools.cache
@@ -101,6 +102,11 @@ def agreement_mjx(size: Size) -> Found:
     yield from _agreement("mjx", size)
 
 
+def agreement_mjx_warp(size: Size) -> Found:
+    """Measure MJX with the Warp kernel in the place of its time steps against MuJoCo C; see `_agreement`."""
+    yield from _agreement("mjx_warp", size)
+
+
 def agreement_warp(size: Size) -> Found:
     """Measure MuJoCo Warp against MuJoCo C; see `_agreement`."""
     yield from _agreement("warp", size)
@@ -130,8 +136,8 @@ def _agreement(name: Any, size: Size) -> Found:
       NotMeasured: the engine is not installed.
       Wrong: they are too far, or too few.
     """
-    if name == "warp" and not installed("warp"):
-        raise NotMeasured("MuJoCo Warp is not installed; install the extra `warp`")
+    if name.endswith("warp") and not installed("warp"):
+        raise NotMeasured("NVIDIA Warp is not installed; install the extra `warp`")
     made, poses, held = _reference(size)
     tested = engine(name, size)
     make_ready(tested, made.items.scene, made.items.poses)
@@ -150,12 +156,23 @@ def _agreement(name: Any, size: Size) -> Found:
 
 
 def reproducible(size: Size) -> Found:
-    """Measure the share of scenes that MJX simulates twice to the same bytes, in the same batch on the same device.
+    """Measure the share of scenes that MJX, and with it the Warp kernel, simulate twice to the same bytes.
+
+    Both runs are of the same batch on the same device.
 
     Raises:
       Wrong: not all of them.
     """
-    tested, made = engine("mjx", size), _reference(size)[0]
+    yield "", _repeated("mjx", size)
+    if installed("warp"):
+        yield "mjx_warp", _repeated("mjx_warp", size)
+    else:
+        yield "mjx_warp", "not measured: NVIDIA Warp is not installed; install the extra `warp`"
+
+
+def _repeated(name: EngineName, size: Size) -> float:
+    """Return the share of scenes that an engine simulates twice to the same bytes; see `reproducible`."""
+    tested, made = engine(name, size), _reference(size)[0]
     runs = []
     for _ in range(2):
         rollout = primitives.settle(tested, made.items.scene, _raised(made.items.poses), duration=REPEATED_SECONDS)
@@ -166,9 +183,9 @@ def reproducible(size: Size) -> Found:
         same &= (bits[0] == bits[1]).all(-1)
     if not same.all():
         raise Wrong(
-            f"{int((~same).sum())} of {len(same)} scenes end otherwise when they are simulated again; want none"
+            f"{name}: {int((~same).sum())} of {len(same)} scenes end otherwise when they are simulated again; want none"
         )
-    yield "", float(same.mean())
+    return float(same.mean())
 
 
 def _raised(poses: np.ndarray) -> np.ndarray:

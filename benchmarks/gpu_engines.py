@@ -26,7 +26,7 @@ from dipn_jax.physics.warp import WarpEngine
 from dipn_jax.structs import Fault, Push, Rollout, Scene, Trajectory
 from dipn_jax.world import primitives, scenes
 
-ACCELERATORS: tuple[EngineName, ...] = ("mjx", "warp")
+ACCELERATORS: tuple[EngineName, ...] = ("mjx", "mjx_warp", "warp")
 """Engines that simulate on a GPU."""
 MOST_LONGER = 16
 """How many times as long a data set is made at once, where one took too little time to count."""
@@ -88,10 +88,12 @@ def engine(name: EngineName, size: Size, *, batch: int = 0) -> Engine:
 @functools.cache
 def _kept(name: EngineName, batch: int, timestep: float | None) -> Engine:
     """Return MJX or Warp for `batch` scenes at once, with another time step if one is given."""
-    if name == "warp" and not installed("warp"):
-        raise NotMeasured("MuJoCo Warp is not installed; install the extra `warp`")
+    if name.endswith("warp") and not installed("warp"):
+        raise NotMeasured("NVIDIA Warp is not installed; install the extra `warp`")
     kind, config = (WarpEngine, warp.DEFAULTS) if name == "warp" else (MjxEngine, mjx.DEFAULTS)
-    made: Engine = kind(dataclasses.replace(config, timestep=timestep or config.timestep), chunk=batch)
+    solver = "warp" if name == "mjx_warp" else config.solver
+    config = dataclasses.replace(config, timestep=timestep or config.timestep, solver=solver)
+    made: Engine = kind(config, chunk=batch)
     return made
 
 

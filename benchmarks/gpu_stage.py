@@ -90,7 +90,7 @@ def size_of(*, toy: bool, seed: int) -> Size:
         shard=2,
         least_seconds=0.0,
         variants=1,
-        mjx_variants=3,  # the Warp kernels are in the rehearsal
+        mjx_variants=2,  # the Warp kernel is in the rehearsal
         tables=1,
         candidates=4,
         cases=1,

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import inspect
 from typing import Any
 
 import numpy as np
 
-from benchmarks.datagen_mjx import xla_collision
 from benchmarks.gpu_engines import heap_rate, heaps_of, make_ready
 from benchmarks.gpu_stage import Found, NotMeasured, Size, brief, installed
 from dipn_jax.engine import Engine
@@ -20,8 +18,6 @@ from dipn_jax.world import primitives
 
 CONFIG = "config"
 """Key of a variant's changes to the `PhysicsConfig` of its engine."""
-XLA_COLLISION = "xla_collision"
-"""Key of a variant that finds contacts by XLA, though its solver is a Warp kernel."""
 WARP: dict[str, dict[str, Any]] = {
     "warp/as_is": {},
     "warp/dense": {"jacobian": "dense"},
@@ -38,8 +34,7 @@ WARP: dict[str, dict[str, Any]] = {
 """Variants of MuJoCo Warp: arguments of its engine, and changes of its configuration."""
 MJX: dict[str, dict[str, Any]] = {
     "mjx/as_is": {},
-    "mjx/warp_kernels": {CONFIG: {"solver": "warp"}},
-    "mjx/warp_solver_alone": {CONFIG: {"solver": "warp"}, XLA_COLLISION: True},
+    "mjx/warp_kernel": {CONFIG: {"solver": "warp"}},
     "mjx/iterations_15": {CONFIG: {"iterations": 15}},
     "mjx/half_the_contacts": {CONFIG: {"contact_points": (40, 4)}},
 }
@@ -57,7 +52,7 @@ def variant(name: str, *, batch: int, timestep: float | None = None) -> Engine:
     if name.startswith("warp") and not installed("warp"):
         raise NotMeasured("not available: MuJoCo Warp is not installed; install the extra `warp`")
     kind, config = (warp.WarpEngine, warp.DEFAULTS) if name.startswith("warp") else (mjx.MjxEngine, mjx.DEFAULTS)
-    options = {"chunk": batch} | {key: value for key, value in ALL[name].items() if key not in (CONFIG, XLA_COLLISION)}
+    options = {"chunk": batch} | {key: value for key, value in ALL[name].items() if key != CONFIG}
     changes = ({} if timestep is None else {"timestep": timestep}) | ALL[name].get(CONFIG, {})
     unknown = [key for key in options if key not in inspect.signature(kind).parameters]
     unknown += [key for key in changes if key not in {field.name for field in dataclasses.fields(config)}]
@@ -92,8 +87,7 @@ def variants(size: Size) -> Found:
     for name in [*list(MJX)[: size.mjx_variants], *list(WARP)[: size.variants]]:
         try:
             engine = variant(name, batch=batch, timestep=size.timestep)
-            with xla_collision() if XLA_COLLISION in ALL[name] else contextlib.nullcontext():
-                make_ready(engine, scene, poses)
+            make_ready(engine, scene, poses)
             rates[name] = heap_rate(engine, scene, poses, size)
             yield f"{name}/scene_seconds", rates[name]
             rollout = engine.simulate(scene, poses, still, end)

@@ -33,6 +33,13 @@ STAGES = {
         is_check=True,
         goal="<= 1",
     ),
+    "on_gpu.agreement_mjx_warp": Stage(
+        "millimetres of MJX with the Warp kernel from MuJoCo C after 5 cm (p50)",
+        "gpu_correctness:agreement_mjx_warp",
+        60,
+        is_check=True,
+        goal="<= 1",
+    ),
     "on_gpu.agreement_warp": Stage(
         "millimetres of MuJoCo Warp from MuJoCo C after 5 cm (p50)",
         "gpu_correctness:agreement_warp",
@@ -41,7 +48,7 @@ STAGES = {
         goal="<= 1",
     ),
     "on_gpu.reproducible": Stage(
-        "share of a batch that MJX simulates twice to the same bytes",
+        "share of a batch that MJX simulates twice to the same bytes, and with the Warp kernel",
         "gpu_correctness:reproducible",
         60,
         is_check=True,

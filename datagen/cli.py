@@ -32,7 +32,7 @@ class Work:
     """The engine that makes a data set, and the part of it that this worker makes."""
 
     engine: EngineName = "auto"
-    """native (CPU), mjx (XLA), mjx_warp (XLA, its contacts by kernels of NVIDIA Warp), warp (MuJoCo Warp), or auto."""
+    """native (CPU), mjx (XLA), mjx_warp (its time steps by a kernel of NVIDIA Warp), warp (MuJoCo Warp), or auto."""
     timestep: float | None = None
     """Seconds of a physics step; the engine's own if not given."""
     shard: int = 0

@@ -29,7 +29,7 @@ class PhysicsConfig:
     sleep: float = 0.0  # m/s below which resting objects are left out of steps until they are touched (0: never)
     geom_pairs: tuple[int, int] | None = None  # MJX: pairs kept by the broad phase: at least, and per object
     contact_points: tuple[int, int] | None = None  # MJX: contacts kept: at least, and per object (None: all)
-    solver: Literal["xla", "warp"] = "xla"  # MJX: `warp`: finds and solves contacts by kernels of Warp (extra)
+    solver: Literal["xla", "warp"] = "xla"  # MJX: `warp`: a kernel of Warp (extra) in its place
 
     def caps(self, slots: int) -> tuple[int, int]:
         """Return how many geom pairs and contacts MJX keeps with `slots` objects; -1 means all."""

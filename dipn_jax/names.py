@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 EngineName = Literal["auto", "native", "mjx", "mjx_warp", "warp"]
-"""A physics engine; `auto` chooses the faster one here. `mjx_warp` is `mjx` with Warp kernels for contacts."""
+"""A physics engine; `auto` chooses the faster one here. `mjx_warp` is `mjx` with a Warp kernel for its time steps."""
 MethodName = Literal["dipn+gn", "dipn+gn+actions", "gn", "dqn+gn", "rea+dipn", "vpg", "physics+gn"]
 """A method that clears tables, named after the networks (or the physics engine) that it decides with."""
 Aid = Literal["mirrors", "fingers", "border", "table", "top", "still", "memory"]

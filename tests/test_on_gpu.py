@@ -289,4 +289,10 @@ def test_all_stages_run_as_small_as_can_be(tmp_path: pathlib.Path, capsys: pytes
     ratio = kept["figures"]["on_gpu.push_episodes_vs_native/mjx_episodes_per_second"]
     native = kept["figures"]["on_gpu.push_episodes_vs_native/native_episodes_per_second"]
     assert kept["figures"]["on_gpu.push_episodes_vs_native/mjx"] == pytest.approx(ratio / native)
+    for kernel in (
+        "push_episodes_vs_native/mjx_warp",
+        "reproducible/mjx_warp",
+        "variants/mjx/warp_kernel/scene_seconds",
+    ):
+        assert kept["figures"][f"on_gpu.{kernel}"] > 0
     assert capsys.readouterr().out.splitlines()[-len(on_gpu.STAGES)].startswith("on_gpu.weights")

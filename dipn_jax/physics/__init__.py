@@ -1,6 +1,6 @@
 """One interface, four engines: `native` (MuJoCo C on CPU threads), `mjx` (XLA: GPU, TPU, CPU), `mjx_warp`, `warp`.
 
-`mjx_warp` is `mjx` with the collision of `narrow` and the solver of `blocks`; `warp` is MuJoCo Warp, for NVIDIA GPUs.
+`mjx_warp` is `mjx` with the kernel of `tick` in the place of MJX; `warp` is MuJoCo Warp, for NVIDIA GPUs.
 
 All read the same MJCF (`dipn_jax.world.model`), take the same arguments and return the same result, so which
 one runs is a configuration value.
@@ -90,8 +90,8 @@ def make_engine(
       engine = dipn_jax.make_engine("native")
       tables = dipn_jax.settled_scenes(jax.random.key(0), engine, dipn_jax.SceneConfig(), 2)
 
-    Making `mjx` or `mjx_warp` patches MuJoCo MJX in the whole process (`physics.patches`); models of other code that
-    uses MJX in the process are passed on to MJX's own functions. `native` and `warp` patch nothing.
+    Making `mjx` patches MuJoCo MJX in the whole process (`physics.patches`); models of other code that uses MJX in the
+    process are passed on to MJX's own functions. The other engines patch nothing.
 
     Args:
       name: engine, or `auto`.

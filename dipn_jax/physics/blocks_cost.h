@@ -1,33 +1,34 @@
-// First part of the body of the function that `blocks_kernel.py` hands to Warp: one scene, LANES lanes that share its
-// memory. What the acceleration costs, with gradient and Hessian; the second part is `blocks_newton.h`.
+// First part of the contact solver, which builds on `lanes.h`: what the acceleration of a scene costs, with gradient and
+// Hessian; the second part is `blocks_newton.h`.
 //
 // The cost is that of `cone.py`. A contact moves two blocks of six degrees of freedom at most, so the Hessian and its
-// Cholesky factor are blocks of 6 x 6, and only those are computed that a contact, or elimination, fills. On a GPU the
-// lanes are a warp; on a CPU there is one lane, or there are fibers, where Warp's `enable_cpu_blocks` is set. Every sum
-// is taken in a fixed order: no atomics.
+// Cholesky factor are blocks of 6 x 6, and only those are computed that a contact, or elimination, fills. Every sum is
+// taken in a fixed order: no atomics.
 //
 // Python puts in front of this text: BLOCKS, CONTACTS, ROWS (capacities), and TOLERANCE, FLAT, NARROW, FIRST, STRETCH
 // and TINY (see `cone.py`).
 
-// A loop that the lanes share; not unrolled, for a kernel of few registers that fits a GPU's instruction cache.
-#define SHARE(i, from, to) WP_PRAGMA_NO_UNROLL for (int i = (from) + lane; i < (to); i += LANES)
+enum { SIX = 6, SQUARE = 36, NONE = BLOCKS, DOF = SIX * (BLOCKS + 1) };
 
-enum { SIX = 6, SQUARE = 36, NONE = BLOCKS, DOF = SIX * (BLOCKS + 1), LANES = WP_TILE_BLOCK_DIM };
+// The problem, which the lanes share.
+struct Problem {
+    float row[ROWS][SIX], row_goal[ROWS], row_weight[ROWS];
+    float slide[CONTACTS][9], spin[2][CONTACTS][9];  // Jacobians [3, 3] of a contact: x, y, z, and the other three
+    float goal[CONTACTS][3], stiffness[CONTACTS], mu[CONTACTS];
+    int side[2][CONTACTS];  // block with the higher number, and the other or NONE
+    int filled[BLOCKS], count;  // bits of the blocks in a row of the factor; contacts that touch
+};
 
-// What the lanes share. The last block of vectors is always zero: it is what a contact with the table moves.
-struct Memory {
+// What the lanes share while they solve it. The last block of vectors is always zero: it is what a contact with the
+// table moves.
+struct Work {
     float hessian[BLOCKS * (BLOCKS + 1) / 2 * SQUARE];  // blocks of the lower triangle, by rows; later the factor
     float at[DOF], lack[DOF], gradient[DOF], step[DOF];  // acceleration; mass * at - force; of the cost; Newton's
-    float row[ROWS][SIX], row_goal[ROWS], row_weight[ROWS];
     float x[ROWS], dx[ROWS], pushing[ROWS];  // residual, its change along the step, weight if the row pushes
-    float slide[CONTACTS][9], spin[2][CONTACTS][9];  // Jacobians [3, 3] of a contact: x, y, z, and the other three
-    float goal[CONTACTS][3], u[CONTACTS][3], du[CONTACTS][3];
+    float u[CONTACTS][3], du[CONTACTS][3];
     float away[CONTACTS][3], bent[CONTACTS][6];  // gradient and Hessian of what a contact pays
-    float stiffness[CONTACTS], mu[CONTACTS];
-    int side[2][CONTACTS];  // block with the higher number, and the other or NONE
     float jacobian[2][3][2 * SIX], weighted[2][3][2 * SIX];  // of one contact, and of the next
     float scratch[LANES];
-    int chosen[CONTACTS], filled[BLOCKS], count;  // contacts that touch; bits of the blocks in a row of the factor
 };
 
 // The place of a residual with respect to its cone, as `cone._Reach`.
@@ -50,14 +51,14 @@ struct Reach {
         }
     }
 
-    // Second derivative of half the squared distance along `w`.
-    CUDA_CALLABLE float curvature(const float* w) const
+    // Second derivative of half the squared distance along `v`.
+    CUDA_CALLABLE float curvature(const float* v) const
     {
-        const float along = tangent[1] * w[1] + tangent[2] * w[2];
-        const float p = w[1] - along * tangent[1], q = w[2] - along * tangent[2];
-        const float in = w[0] + inward[1] * w[1] + inward[2] * w[2];
+        const float along = tangent[1] * v[1] + tangent[2] * v[2];
+        const float p = v[1] - along * tangent[1], q = v[2] - along * tangent[2];
+        const float in = v[0] + inward[1] * v[1] + inward[2] * v[2];
         const float side = in * in + bend * (p * p + q * q);
-        return below ? w[0] * w[0] + w[1] * w[1] + w[2] * w[2] : beside * side;
+        return below ? v[0] * v[0] + v[1] * v[1] + v[2] * v[2] : beside * side;
     }
 
     // Second derivative of half the squared distance, entry (k, l).
@@ -69,19 +70,11 @@ struct Reach {
     }
 };
 
-struct Terms {
-    Memory& s;
+struct Terms : Lanes {
+    Problem& s;
+    Work& w;
     const float *mass, *force, *free;
-    const int lane, blocks, dof, rows, equalities;
-
-    CUDA_CALLABLE void sync() const
-    {
-#if defined(__CUDA_ARCH__)
-        __syncwarp();
-#else
-        WP_TILE_SYNC();
-#endif
-    }
+    const int blocks, dof, rows, equalities;
 
     // Sum of what all lanes bring; the same bits in every lane.
     CUDA_CALLABLE float sum(float mine) const
@@ -93,17 +86,17 @@ struct Terms {
 #else
         if (LANES == 1)
             return mine;
-        s.scratch[lane] = mine;
+        w.scratch[lane] = mine;
         sync();
         float all = 0.0f;
         for (int i = 0; i < LANES; ++i)
-            all += s.scratch[i];
+            all += w.scratch[i];
         sync();
         return all;
 #endif
     }
 
-    CUDA_CALLABLE float* block(int i, int j) const { return s.hessian + (i * (i + 1) / 2 + j) * SQUARE; }
+    CUDA_CALLABLE float* block(int i, int j) const { return w.hessian + (i * (i + 1) / 2 + j) * SQUARE; }
 
     CUDA_CALLABLE bool has(int i, int j) const { return s.filled[i] >> j & 1; }
 
@@ -151,30 +144,30 @@ struct Terms {
         }
     }
 
-    // Compute at `s.at` what every contact and row pays, and its derivatives; return the cost.
+    // Compute at `w.at` what every contact and row pays, and its derivatives; return the cost.
     CUDA_CALLABLE float evaluate() const
     {
         sync();
         float cost = 0.0f;
         SHARE(i, 0, dof) {
-            s.lack[i] = mass_product(i, s.at) - force[i];
-            cost += s.lack[i] * (s.at[i] - free[i]);
+            w.lack[i] = mass_product(i, w.at) - force[i];
+            cost += w.lack[i] * (w.at[i] - free[i]);
         }
         SHARE(r, 0, rows) {
-            s.x[r] = row_product(r, s.at) - s.row_goal[r];
-            s.pushing[r] = r < equalities || s.x[r] < 0.0f ? s.row_weight[r] : 0.0f;
-            cost += s.pushing[r] * s.x[r] * s.x[r];
+            w.x[r] = row_product(r, w.at) - s.row_goal[r];
+            w.pushing[r] = r < equalities || w.x[r] < 0.0f ? s.row_weight[r] : 0.0f;
+            cost += w.pushing[r] * w.x[r] * w.x[r];
         }
         SHARE(c, 0, s.count) {
             for (int k = 0; k < 3; ++k)
-                s.u[c][k] = product(c, k, s.at) - s.goal[c][k];
-            const Reach reach(s.u[c], s.mu[c]);
+                w.u[c][k] = product(c, k, w.at) - s.goal[c][k];
+            const Reach reach(w.u[c], s.mu[c]);
             const float stiff = s.stiffness[c];
             for (int k = 0; k < 3; ++k) {
-                s.away[c][k] = stiff * reach.away[k];
-                cost += s.away[c][k] * reach.away[k];
+                w.away[c][k] = stiff * reach.away[k];
+                cost += w.away[c][k] * reach.away[k];
                 for (int l = 0; l <= k; ++l)
-                    s.bent[c][k * (k + 1) / 2 + l] = stiff * reach.entry(k, l);
+                    w.bent[c][k * (k + 1) / 2 + l] = stiff * reach.entry(k, l);
             }
         }
         cost = sum(cost) / 2.0f;
@@ -192,18 +185,18 @@ struct Terms {
                 if (has(b, j))
                     for (int q = 0; q < SIX; ++q)
                         block(b, j)[i % SIX * SIX + q] = j == b ? mass[SIX * i + q] : 0.0f;
-            s.gradient[i] = s.lack[i];
+            w.gradient[i] = w.lack[i];
             for (int r = 0; i < SIX && r < rows; ++r) {
-                const float part = s.pushing[r] * s.row[r][i];
-                s.gradient[i] += part * s.x[r];
+                const float part = w.pushing[r] * s.row[r][i];
+                w.gradient[i] += part * w.x[r];
                 for (int q = 0; q < SIX; ++q)
-                    s.hessian[SIX * i + q] += part * s.row[r][q];
+                    w.hessian[SIX * i + q] += part * s.row[r][q];
             }
         }
         sync();
         int buffer = 0;
         for (int c = 0; c < s.count; ++c) {
-            const float* b = s.bent[c];
+            const float* b = w.bent[c];
             if (b[0] == 0.0f)  // it does not push
                 continue;
             const int high = s.side[0][c], low = s.side[1][c], columns = low == NONE ? SIX : 2 * SIX;
@@ -212,13 +205,13 @@ struct Terms {
                 float j[3], pull = 0.0f;
                 for (int k = 0; k < 3; ++k) {
                     j[k] = q < 3 ? (which ? -1.0f : 1.0f) * s.slide[c][3 * k + q] : s.spin[which][c][3 * k + q - 3];
-                    s.jacobian[buffer][k][col] = j[k];
-                    pull += s.away[c][k] * j[k];
+                    w.jacobian[buffer][k][col] = j[k];
+                    pull += w.away[c][k] * j[k];
                 }
-                s.weighted[buffer][0][col] = b[0] * j[0] + b[1] * j[1] + b[3] * j[2];
-                s.weighted[buffer][1][col] = b[1] * j[0] + b[2] * j[1] + b[4] * j[2];
-                s.weighted[buffer][2][col] = b[3] * j[0] + b[4] * j[1] + b[5] * j[2];
-                s.gradient[SIX * s.side[which][c] + q] += pull;
+                w.weighted[buffer][0][col] = b[0] * j[0] + b[1] * j[1] + b[3] * j[2];
+                w.weighted[buffer][1][col] = b[1] * j[0] + b[2] * j[1] + b[4] * j[2];
+                w.weighted[buffer][2][col] = b[3] * j[0] + b[4] * j[1] + b[5] * j[2];
+                w.gradient[SIX * s.side[which][c] + q] += pull;
             }
             sync();
             SHARE(task, 0, low == NONE ? SIX : 3 * SIX) {
@@ -226,9 +219,9 @@ struct Terms {
                 const int from = part == 2 ? SIX : 0, to = part ? SIX : 0;
                 float* target = block(part == 2 ? low : high, part ? low : high) + SIX * r;
                 for (int k = 0; k < 3; ++k) {
-                    const float x = s.jacobian[buffer][k][from + r];
+                    const float x = w.jacobian[buffer][k][from + r];
                     for (int q = 0; q < SIX; ++q)
-                        target[q] += x * s.weighted[buffer][k][to + q];
+                        target[q] += x * w.weighted[buffer][k][to + q];
                 }
             }
             buffer = 1 - buffer;  // the next contact's is written while this one's is still read

@@ -4,7 +4,8 @@ Shapes, sizes, masses, friction, poses and trajectories are traced; only the num
 slots is compiled in. So all primitives and all scenes of one layout share one program (see `prisms` for how).
 
 Friction cones are elliptic, as in the native engine, with our own solver (`cone`), because MJX's diverges in float32.
-MJX cannot be given another solver, so making an engine patches MJX in the whole process (see `patches`).
+MJX cannot be given another solver, so making an engine patches MJX in the whole process (see `patches`). Where the
+configuration says `warp`, time steps are not MJX's: they are those of one kernel (see `tick`), and nothing is patched.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jaxtyping import Float
 from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig, Stopped
 from dipn_jax.errors import UserError
-from dipn_jax.physics import blocks, patches, program_cache
+from dipn_jax.physics import patches, program_cache, tick
 from dipn_jax.physics.mjx_program import Program
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 
@@ -51,7 +52,7 @@ class MjxEngine:
     def __init__(
         self, config: PhysicsConfig = DEFAULTS, *, chunk: int | None = None, devices: Sequence[jax.Device] | None = None
     ) -> None:
-        """Make an engine and patch MJX; programs are compiled when a layout is first simulated.
+        """Make an engine, and patch MJX where it steps; programs are compiled when a layout is first simulated.
 
         Args:
           config: solver settings; the control period must be a whole number of time steps.
@@ -66,8 +67,9 @@ class MjxEngine:
         self.substeps = physics.substeps(config)
         local = list(devices or jax.local_devices())
         if config.solver == "warp":
-            blocks.check(local[0].platform)
-        patches.register()
+            tick.check(local[0].platform)
+        else:
+            patches.register()
         self.config = config
         self.devices = local[: 1 << (len(local).bit_length() - 1)]
         if chunk and chunk & (chunk - 1):
@@ -133,8 +135,6 @@ class MjxEngine:
         """Return the compiled function for `size` scenes of `slots` objects; each device runs its share by itself."""
         key = size, slots, len(arguments[4]), arguments[2].time.shape[1]
         if key not in self.programs:
-            if self.config.solver == "warp":
-                blocks.capacity(slots, self.config.caps(slots)[1])
             made = Program(self.config, slots, self.substeps)
             alone = len(self.devices) == 1 and self.devices[0].platform == jax.default_backend()
             kept_on_disk = alone and self.config.solver == "xla"  # a call of Warp is of this process

@@ -17,6 +17,7 @@ from dipn_jax import physics
 from dipn_jax.engine import PhysicsConfig
 from dipn_jax.physics import colliders, faults, prisms, recording
 from dipn_jax.physics.recording import Record, State
+from dipn_jax.physics.tick import Tick, scene_fields
 from dipn_jax.structs import Array, Rollout, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
 from dipn_jax.world import model, shapes
@@ -41,6 +42,8 @@ class Program:
         scene = Scene(np.zeros(slots, np.int32), np.full((slots, 3), 0.05), np.zeros((slots, 3)), full, full)
         spec = mujoco.MjModel.from_xml_string(model.mjcf(scene, config=config, generic=True))
         _adapt(spec)
+        by_kernel = config.solver == "warp"
+        self.kernel = Tick(spec, slots=slots, contacts=self.contacts, substeps=substeps) if by_kernel else None
         self.base = mjx.put_model(spec, impl="jax")
         self.data = mjx.make_data(self.base)
         self.first_geom, self.first_body = spec.ngeom - slots * shapes.CONVEX_PARTS, spec.nbody - slots
@@ -150,7 +153,7 @@ class Program:
         }
 
     def _hulls(self, parts: Any) -> Any:
-        """Return the hulls of all geoms: of the gripper's boxes (`narrow` reads them), then `parts [3 N, ...]`.
+        """Return the hulls of all geoms: of the gripper's boxes (the kernel reads them), then `parts [3 N, ...]`.
 
         The first row is of the floor; it has no size, and nothing reads it.
         """
@@ -160,16 +163,19 @@ class Program:
 
     def _tick(self, fields: dict[str, Any], state: State, ctrl: jax.Array, force: jax.Array) -> State:
         """Advance one scene by one control period."""
+        if self.kernel is not None:
+            return self.kernel.advance(scene_fields(fields), state, ctrl, force)
         m = self.base.tree_replace(fields)
+        each = functools.partial(self._substep, m, ctrl, force)
+        return jax.lax.scan(lambda state, _: (each(state), None), state, None, length=self.substeps)[0]
 
-        def substep(state: State, _: None) -> tuple[State, None]:
-            d = self.data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)
-            d = mjx.step(m, d.replace(ctrl=ctrl, qfrc_applied=force))
-            full = state.full | self._saturated(m, d)
-            depth = jnp.maximum(0.0, -d._impl.contact.dist.min())
-            return jax.tree.map(_strong, State(d.qpos, d.qvel, d.qacc_warmstart, full, depth), state), None
-
-        return jax.lax.scan(substep, state, None, length=self.substeps)[0]
+    def _substep(self, m: Any, ctrl: jax.Array, force: jax.Array, state: State) -> State:
+        """Advance one scene by one time step of MJX."""
+        d = self.data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)
+        d = mjx.step(m, d.replace(ctrl=ctrl, qfrc_applied=force))
+        full = state.full | self._saturated(m, d)
+        depth = jnp.maximum(0.0, -d._impl.contact.dist.min())
+        return jax.tree.map(_strong, State(d.qpos, d.qvel, d.qacc_warmstart, full, depth), state)
 
     def _saturated(self, m: Any, d: Any) -> jax.Array:
         """Return whether MJX may have left out a touching pair or a contact in this step, which it does not report."""

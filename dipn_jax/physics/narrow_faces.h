@@ -1,5 +1,5 @@
-// Second part of the body of the function that `narrow_kernel.py` hands to Warp (`struct Shared` goes on): up to four
-// contacts of one face with another, chosen as by `_create_contact_manifold` and `_manifold_points` of MJX.
+// Second part of the search for contacts (`struct Pair` goes on): up to four contacts of one face with another, chosen
+// as by `_create_contact_manifold` and `_manifold_points` of MJX.
 
     // Clip an edge by the planes through the edges of a face; returns whether anything of it is inside.
     CUDA_CALLABLE bool clip(const Hull& hull, int face, Vector& p, Vector& q) const

@@ -1,50 +1,13 @@
-// First part of the body of the function that `narrow_kernel.py` hands to Warp: one pair of geoms, LANES lanes that
-// share its memory. Two prisms in world axes, and how far they are apart along the normals of their faces.
+// First part of the search for contacts of one pair of geoms, which builds on `lanes.h`: two prisms in world axes, and
+// how far they are apart along the normals of their faces.
 //
-// On a GPU the lanes are a warp; on a CPU there is one lane, or there are fibers, where Warp's `enable_cpu_blocks` is
-// set. Lanes only ever compare what they found, so the result has the same bits however many there are. The rules are
-// those of `colliders.py`, and so are most names; repeated corners, faces and edges are left out.
+// Lanes only ever compare what they found, so the result has the same bits however many there are. The rules are those
+// of `colliders.py`, and so are most names; repeated corners, faces and edges are left out.
 //
-// Python puts in front of this text: RING (corners of a ring), CONTACTS (of a pair), and the numbers of `colliders.py`.
+// Python puts in front of this text: RING (corners of a ring), EACH (contacts of a pair), and the numbers of
+// `colliders.py`.
 
-// A loop that the lanes share; not unrolled, for a kernel of few registers that fits a GPU's instruction cache.
-#define SHARE(i, from, to) WP_PRAGMA_NO_UNROLL for (int i = (from) + lane; i < (to); i += LANES)
-
-enum {
-    VERTICES = 2 * RING,
-    FACES = RING + 2,
-    EDGES = 3 * RING,
-    POINTS = 4 * RING,
-    FRAME = 9,
-    LANES = WP_TILE_BLOCK_DIM
-};
-
-struct Vector {
-    float x, y, z;
-
-    static CUDA_CALLABLE Vector of(const float* p) { return { p[0], p[1], p[2] }; }
-
-    CUDA_CALLABLE Vector operator+(const Vector& o) const { return { x + o.x, y + o.y, z + o.z }; }
-
-    CUDA_CALLABLE Vector operator-(const Vector& o) const { return { x - o.x, y - o.y, z - o.z }; }
-
-    CUDA_CALLABLE Vector operator*(float a) const { return { a * x, a * y, a * z }; }
-
-    CUDA_CALLABLE float dot(const Vector& o) const { return x * o.x + y * o.y + z * o.z; }
-
-    CUDA_CALLABLE float square() const { return dot(*this); }
-
-    CUDA_CALLABLE Vector cross(const Vector& o) const
-    {
-        return { y * o.z - z * o.y, z * o.x - x * o.z, x * o.y - y * o.x };
-    }
-
-    CUDA_CALLABLE Vector unit() const
-    {
-        const float length = wp::sqrt(square());
-        return *this * (length > 0.0f ? 1.0f / length : 0.0f);
-    }
-};
+enum { VERTICES = 2 * RING, FACES = RING + 2, EDGES = 3 * RING, POINTS = 4 * RING };
 
 // The largest value so far and the first index that has it.
 struct Best {
@@ -91,27 +54,26 @@ struct Hull {
     CUDA_CALLABLE int right(int e) const { return e < c ? c : e < 2 * c ? c + 1 : e - 2 * c; }
 };
 
+// A geom of a pair: its hull, and how it stands.
+struct Geom {
+    const float *corners, *normals;  // [VERTICES, 3] and [FACES, 3], in its own frame
+    const float* turn;  // [3, 3], from that to the world's
+    Vector shift;  // metres, world
+};
+
 // What the lanes share.
-struct Memory {
+struct PairMemory {
     Hull hull[2];
     Vector point[POINTS];  // candidates for contacts
     float height[POINTS];  // over the reference face, or the plane
     float value[LANES];
     int index[LANES];
+    Vector where[EACH];  // of the contacts, metres, about the second geom
+    float depth[EACH];  // of the contacts: below zero where there is one
 };
 
-struct Shared {
-    Memory& s;
-    const int lane;
-
-    CUDA_CALLABLE void sync() const
-    {
-#if defined(__CUDA_ARCH__)
-        __syncwarp();
-#else
-        WP_TILE_SYNC();
-#endif
-    }
+struct Pair : Lanes {
+    PairMemory& s;
 
     // The best of what all lanes bring.
     CUDA_CALLABLE Best best(Best mine) const
@@ -137,23 +99,22 @@ struct Shared {
     }
 
     // Put a hull into shared memory: turned by the matrix `turn`, then moved by `shift`.
-    CUDA_CALLABLE void place(int which, const float* corners, const float* normals, const float* turn, Vector shift)
-        const
+    CUDA_CALLABLE void place(int which, const Geom& geom, const Vector& shift) const
     {
         Best last { -1.0f, 0 };  // the last corner that is no repetition of the one before it
         SHARE(k, 1, RING) {
-            const float *p = corners + 3 * k, *q = p - 3;
+            const float *p = geom.corners + 3 * k, *q = p - 3;
             last.offer(p[0] != q[0] || p[1] != q[1] || p[2] != q[2] ? 1.0f * k : -1.0f, k);
         }
         Hull& hull = s.hull[which];
         const int c = best(last).index + 1;
-        const Vector x = Vector::of(turn), y = Vector::of(turn + 3), z = Vector::of(turn + 6);
+        const Vector x = Vector::of(geom.turn), y = Vector::of(geom.turn + 3), z = Vector::of(geom.turn + 6);
         SHARE(i, 0, 2 * c) {
-            const Vector v = Vector::of(corners + 3 * (i < c ? i : i - c + RING));
+            const Vector v = Vector::of(geom.corners + 3 * (i < c ? i : i - c + RING));
             hull.vertex[i] = Vector { x.dot(v), y.dot(v), z.dot(v) } + shift;
         }
         SHARE(f, 0, c + 2) {
-            const Vector n = Vector::of(normals + 3 * (f < c - 1 ? f : f - c + RING));
+            const Vector n = Vector::of(geom.normals + 3 * (f < c - 1 ? f : f - c + RING));
             hull.normal[f] = { x.dot(n), y.dot(n), z.dot(n) };
         }
         if (lane == 0)

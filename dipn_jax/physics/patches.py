@@ -2,8 +2,8 @@
 
 MJX cannot be given another solver or other colliders, so `register` replaces functions in its modules:
 
-- `solver.solve`, by `cone.solve` or, where the MJCF says so, `blocks.solve`: contacts with elliptic friction cones;
-- the colliders of meshes with planes, boxes and meshes, by `colliders.collide` or, likewise, `narrow.collide`.
+- `solver.solve`, by `cone.solve`: contacts with elliptic friction cones;
+- the colliders of meshes with planes, boxes and meshes, by `colliders.collide`.
 
 Every replacement looks at the model first. A model that was not made from our MJCF (`world.model.mjcf`) is passed on to
 MJX's own function, so other users of MJX in the same process get the results that they would get without us.
@@ -19,7 +19,7 @@ from mujoco.mjx._src import collision_driver, solver
 from mujoco.mjx._src.types import GeomType
 
 from dipn_jax.errors import UserError
-from dipn_jax.physics import blocks, colliders, cone, narrow
+from dipn_jax.physics import colliders, cone
 from dipn_jax.world import model
 
 _PATCHED_PAIRS = tuple((kind, GeomType.MESH) for kind in (GeomType.PLANE, GeomType.BOX, GeomType.MESH))
@@ -42,12 +42,7 @@ def register() -> None:
 
 def is_ours(m: Any) -> bool:
     """Return whether an MJX model was made from our MJCF, which holds a custom number called `model.MARK`."""
-    return _has_number(m, model.MARK)
-
-
-def _has_number(m: Any, name: str) -> bool:
-    """Return whether an MJX model has a custom number of that name."""
-    return any(m.names[start:].split(b"\0", 1)[0] == name.encode() for start in m.name_numericadr)
+    return any(m.names[start:].split(b"\0", 1)[0] == model.MARK.encode() for start in m.name_numericadr)
 
 
 def _solver(upstream: Callable[..., Any]) -> Callable[..., Any]:
@@ -56,7 +51,7 @@ def _solver(upstream: Callable[..., Any]) -> Callable[..., Any]:
     def solve(m: Any, d: Any) -> Any:
         if not (is_ours(m) and cone.is_supported(m, d)):
             return upstream(m, d)
-        return blocks.solve(m, d) if _has_number(m, model.WARP_MARK) else cone.solve(m, d)
+        return cone.solve(m, d)
 
     solve.upstream = upstream  # type: ignore[attr-defined]
     return solve
@@ -72,8 +67,7 @@ def _collider(upstream: Callable[..., Any]) -> Callable[..., Any]:
 
     def collide(m: Any, d: Any, key: Any, geom: jax.Array) -> Any:
         if is_ours(m) and colliders.is_traced(m, key):
-            ours = narrow if _has_number(m, model.WARP_MARK) else colliders
-            return ours.collide(m, d, key, geom)
+            return colliders.collide(m, d, key, geom)
         return upstream(m, d, key, geom)
 
     collide.ncon = upstream.ncon  # type: ignore[attr-defined]  # MJX reads it

@@ -17,8 +17,6 @@ from dipn_jax.world import shapes
 
 MARK = "dipn_jax"
 """Name of a custom number in our MJCF that marks a model as ours (`physics.patches` looks for it)."""
-WARP_MARK = "dipn_jax_warp"
-"""Name of a custom number in models whose contacts the engine `mjx` leaves to Warp kernels (`PhysicsConfig.solver`)."""
 GRIPPER_DOF = 6
 """Degrees of freedom of the gripper: x, y, z, yaw, two fingers. Each object follows with 7 qpos and 6 qvel."""
 OBJECT_FRICTION_RATIO = 0.5 / 0.35
@@ -168,7 +166,6 @@ def mjcf(
     nearest = "" if generic else '<sensor><contact name="nearest" data="dist" reduce="mindist" num="1"/></sensor>'
     jacobian = "dense" if generic else "auto"  # sparse from nine objects on: 30 fall in 0.7 of the time
     pairs, contacts = config.caps(n)
-    mark = f'<numeric name="{WARP_MARK}" data="1"/>' if config.solver == "warp" else ""
     c, sleep = config, ' sleep="enable"' if config.sleep else ""
     return f"""<mujoco model="dipn">
 <compiler angle="radian"/>
@@ -176,7 +173,7 @@ def mjcf(
  iterations="{c.iterations}" ls_iterations="{c.ls_iterations}" tolerance="{c.tolerance}" jacobian="{jacobian}"
  sleep_tolerance="{c.sleep}"> <flag multiccd="enable" autoreset="disable"{sleep}/></option>
 <custom><numeric name="max_geom_pairs" data="{pairs}"/>
- <numeric name="max_contact_points" data="{contacts}"/><numeric name="{MARK}" data="1"/>{mark}</custom>
+ <numeric name="max_contact_points" data="{contacts}"/><numeric name="{MARK}" data="1"/></custom>
 <default><geom solref="{c.solref}" solimp="{c.solimp}"/><pair condim="3" solref="{c.solref}" solimp="{c.solimp}"/>
  <default class="object"><geom contype="1" conaffinity="3" condim="3"/></default>
  <default class="link">

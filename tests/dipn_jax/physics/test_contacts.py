@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import search_kernel
 from object_sizes import SIZES
 
 from dipn_jax import geometry
-from dipn_jax.physics import colliders, mjx, narrow, prisms
+from dipn_jax.physics import colliders, mjx, prisms
 from dipn_jax.structs import Scene
 from dipn_jax.world import model, shapes
 
@@ -26,10 +27,6 @@ ROUNDING = 2e-6
 CLIPPED = 5e-5
 """Metres that a contact may be outside a hull: MJX clips by planes whose normals are as long as an edge."""
 PAIRS = 400
-MOST_REGISTERS = 96
-"""With more, fewer than 20 warps fit a multiprocessor (65,536 registers)."""
-MOST_SHARED = 11 * 1024
-"""Bytes of a pair; with more, fewer than 20 warps fit a multiprocessor."""
 
 
 def _random_pairs(count: int) -> tuple[Scene, np.ndarray]:
@@ -47,11 +44,8 @@ def _random_pairs(count: int) -> tuple[Scene, np.ndarray]:
 
 
 @jax.jit
-def _depths(scene: Scene, poses: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-    """Return, by XLA and by the kernel, least distances between parts `[B, P, P]` and of the first object to the table.
-
-    They are 1 where the parts are apart.
-    """
+def _depths_by_xla(scene: Scene, poses: jax.Array) -> tuple[Any, Any, tuple[jax.Array, jax.Array]]:
+    """Return the hulls `[B, 2, P]`, their radii, and what `_depths` returns."""
     parts = jax.vmap(jax.vmap(prisms.parts))(scene.shape, scene.size)
     turn = geometry.quat_to_matrix(poses[..., 3:])
     pos = poses[..., None, :3] + jnp.einsum("bnij,bnpj->bnpi", turn, parts.center)
@@ -62,26 +56,34 @@ def _depths(scene: Scene, poses: jax.Array) -> list[tuple[jax.Array, jax.Array]]
     each = jax.vmap(jax.vmap(colliders.convex_prism, (None, 0)), (0, None))
     plane = colliders.GeomInfo(jnp.zeros(3), jnp.eye(3), jnp.zeros(3))
     table = jax.vmap(jax.vmap(colliders.plane_prism, (None, 0)), (None, 0))(plane, first)
-    by_xla = jax.vmap(each)(first, second)[0].min(-1), table[0].min(-1)
+    return hulls, parts.radius, (jax.vmap(each)(first, second)[0].min(-1), table[0].min(-1))
 
-    count = shapes.CONVEX_PARTS
-    flat = jax.tree.map(lambda leaf: leaf.reshape(len(poses), 2 * count, *leaf.shape[3:]), (hulls, parts.radius))
-    floor = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[:, :1]), flat)
-    floor = floor[0].replace(mat=jnp.broadcast_to(jnp.eye(3), floor[0].mat.shape)), floor[1]
-    all_, radius = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, 1), flat, floor)
-    pairs = np.stack(np.meshgrid(np.arange(count), count + np.arange(count), indexing="ij"), -1).reshape(-1, 2)
-    lows = np.stack([np.full(count, 2 * count), np.arange(count)], -1)
-    found = []
-    for geom, planes in ((pairs, False), (lows, True)):
-        one = lambda *leaves, g=geom, p=planes: narrow.contacts(*leaves, jnp.asarray(g), planes=p)[0]  # noqa: E731
-        found.append(jax.vmap(one)(all_.vert, all_.face_normal, radius, all_.pos, all_.mat).min(-1))
-    return [by_xla, (found[0].reshape(-1, count, count), found[1])]
+
+def _depths(scene: Scene, poses: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return, by XLA and by the kernel, least distances between parts `[B, P, P]` and of the first object to the table.
+
+    They are 1 where the parts are apart.
+    """
+    with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):  # as in the engine
+        hulls, radius, by_xla = jax.device_get(_depths_by_xla(scene, poses))
+    batch, count = len(poses), shapes.CONVEX_PARTS
+    flat = jax.tree.map(lambda leaf: leaf.reshape(2 * batch * count, *leaf.shape[3:]), hulls)
+    hull = np.arange(2 * batch * count).reshape(batch, 2, count)
+    pairs = np.stack(np.broadcast_arrays(hull[:, 0, :, None], hull[:, 1, None]), -1).reshape(-1, 2)
+    low = np.stack(np.broadcast_arrays(2 * batch * count, hull[:, 0]), -1).reshape(-1, 2)
+    more = jax.tree.map(lambda leaf: np.concatenate([leaf, np.zeros_like(leaf[:1])]), flat)
+    more.mat[-1] = np.eye(3)
+    arrays = more.vert, more.face_normal, np.append(radius.ravel(), 0), more.pos, more.mat
+    between, table = (
+        search_kernel.contacts(*arrays, which, planes=planes)[0].min(-1)
+        for which, planes in ((pairs, False), (low, True))
+    )
+    return [by_xla, (between.reshape(batch, count, count), table.reshape(batch, count))]
 
 
 def test_contact_depths_agree_with_mujoco_c() -> None:
     scene, poses = _random_pairs(100)
-    with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):  # as in the engine
-        both = jax.tree.map(np.asarray, _depths(scene, poses))
+    both = _depths(scene, poses)
     touching = 0
     for b in range(len(poses)):
         one = jax.tree.map(lambda leaf, b=b: leaf[b], scene)
@@ -143,7 +145,7 @@ def placed() -> tuple[Any, np.ndarray, np.ndarray]:
 
 
 def _arrays(hulls: Any, radius: np.ndarray, pairs: np.ndarray) -> tuple[Any, ...]:
-    """Return the first arguments of `narrow.contacts`."""
+    """Return the arguments of `search_kernel.contacts`."""
     return hulls.vert, hulls.face_normal, radius, hulls.pos, hulls.mat, pairs.astype(np.int32)
 
 
@@ -158,7 +160,7 @@ def test_the_kernel_finds_the_contacts_of_xla(placed: tuple[Any, np.ndarray, np.
     first, second = (jax.tree.map(lambda leaf, i=i: leaf[i::2], hulls) for i in (0, 1))
     with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):
         wanted = jax.device_get(jax.jit(jax.vmap(colliders.convex_prism))(first, second))
-    found = jax.device_get(jax.jit(narrow.contacts)(*_arrays(hulls, radius, np.arange(2 * PAIRS).reshape(-1, 2))))
+    found = search_kernel.contacts(*_arrays(hulls, radius, np.arange(2 * PAIRS).reshape(-1, 2)))
     deepest, touches = found[0].min(-1), found[0] < 0
     np.testing.assert_allclose(deepest, wanted[0].min(-1), atol=ROUNDING)
     touching = touches.any(-1)
@@ -190,8 +192,7 @@ def test_the_kernel_finds_the_contacts_of_a_plane(placed: tuple[Any, np.ndarray,
         more = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[:1]]), hulls)
         more.pos[-1], more.mat[-1] = plane.pos, plane.mat
         pairs = np.stack([np.full(count, count), np.arange(count)], -1)
-        call = jax.jit(lambda *leaves: narrow.contacts(*leaves, planes=True))
-        found = jax.device_get(call(*_arrays(more, np.append(radius, -np.inf).astype(np.float32), pairs)))
+        found = search_kernel.contacts(*_arrays(more, np.append(radius, -np.inf), pairs), planes=True)
         touches = found[0] < 0
         assert touches.any(-1).sum() > 100 and (touches.all(-1).sum() > 20 or mat[0, 0] < 1)
         np.testing.assert_allclose(found[2][touches], wanted[2][touches], atol=1e-6)
@@ -208,10 +209,10 @@ def test_boxes_are_as_deep_as_in_mujoco_c() -> None:
     mat *= np.linalg.det(mat)[..., None, None]
     pos = np.zeros((count, 2, 3))
     pos[:, 1] = rng.uniform(-0.03, 0.03, (count, 3))
-    call, pairs = jax.jit(narrow.contacts), np.arange(2 * count).reshape(-1, 2)
+    pairs = np.arange(2 * count).reshape(-1, 2)
     for depth in (rng.uniform(0.0005, 0.0025, count), None):
         flat = [np.float32(x).reshape(2 * count, *x.shape[2:]) for x in (size, pos, mat)]
-        found, _, frame = jax.device_get(call(*_arrays(*_hulls(np.zeros(2 * count, np.int32), *flat), pairs)))
+        found, _, frame = search_kernel.contacts(*_arrays(*_hulls(np.zeros(2 * count, np.int32), *flat), pairs))
         if depth is not None:  # move the second away from the first until it is only that deep
             pos[:, 1] += (-found.min(-1) - depth)[:, None] * frame[:, 0, 0]
     body = '<body mocap="true"><geom type="box" size="1 1 1"/></body>'
@@ -241,29 +242,9 @@ def test_what_is_far_dead_or_nowhere_has_finite_numbers(placed: tuple[Any, np.nd
     pos[5], dead = 0, np.array(radius)
     dead[5] = -np.inf
     for planes in (False, True):
-        found = jax.device_get(narrow.contacts(*_arrays(hulls.replace(pos=pos), dead, pairs), planes=planes))
+        found = search_kernel.contacts(*_arrays(hulls.replace(pos=pos), dead, pairs), planes=planes)
         assert (found[0] == colliders.APART_DISTANCE).all() and (found[1] == 0).all()
         np.testing.assert_array_equal(found[2], np.broadcast_to(np.eye(3), found[2].shape))
-
-
-def test_calls_of_any_size_are_the_first_of_their_name() -> None:
-    """Where they are not, another process has another program, and compiles it again."""
-    for geoms in (7, 9):
-        some = [jnp.zeros((geoms, *shape)) for shape in ((24, 3), (14, 3), (), (3,), (3, 3))]
-        text = jax.jit(narrow.contacts).lower(*some, jnp.zeros((5, 2), jnp.int32)).as_text()
-        assert f"@narrow_{geoms}_5_0_0(" in text and "launch_id = 0 " in text
-
-
-def _launched(arrays: tuple[Any, ...], lanes: int, *, planes: bool) -> list[np.ndarray]:
-    """Return what the kernel gives, launched with that many lanes on the CPU."""
-    import warp
-
-    native, count = narrow.load(), len(arrays[-1])
-    inputs = [warp.array(x.ravel(), dtype=warp.int32 if x.dtype.kind == "i" else float) for x in arrays]
-    out = [warp.zeros(4 * size * count, dtype=float) for size in (1, 3, 9)]
-    inputs += [len(arrays[0]), count, int(planes), *out]
-    warp.launch(native.kernel(), dim=(count, native.LANES), inputs=inputs, block_dim=lanes, device="cpu")
-    return [x.numpy() for x in out]
 
 
 @pytest.mark.parametrize("planes", [False, True])
@@ -274,20 +255,9 @@ def test_lanes_wait_for_one_another(
     import warp
 
     arrays = _arrays(*placed[:2], np.arange(2 * PAIRS).reshape(-1, 2))
-    alone = _launched(arrays, 1, planes=planes)
+    alone = search_kernel.contacts(*arrays, planes=planes)
     monkeypatch.setattr(warp.config, "enable_cpu_blocks", True)
-    together = _launched(arrays, 32, planes=planes)
-    for ours, theirs, again in zip(together, alone, _launched(arrays, 32, planes=planes), strict=True):
+    together, again = (search_kernel.contacts(*arrays, planes=planes, lanes=32) for _ in range(2))
+    for ours, theirs, repeated in zip(together, alone, again, strict=True):
         np.testing.assert_array_equal(ours, theirs)
-        np.testing.assert_array_equal(ours, again)
-
-
-def test_on_a_gpu_nothing_is_spilled(tmp_path: Any) -> None:
-    import cubin
-    import warp
-
-    module = narrow.load().kernel().module
-    (path,) = warp.compile_aot_module(module, arch=90, use_ptx=False, module_dir=tmp_path, strip_hash=None)
-    used = cubin.resources(path.read_bytes())
-    assert used.stack == 0, "registers or arrays are in local memory"
-    assert used.registers <= MOST_REGISTERS and 0 < used.shared <= MOST_SHARED
+        np.testing.assert_array_equal(ours, repeated)
