@@ -80,7 +80,9 @@ def ratio_difference(
 def _groups(trials: np.ndarray, groups: Sequence[Any] | None) -> int:
     """Return the number of groups that have a trial; where there is one, the number of its tables with a trial."""
     tables = np.flatnonzero(trials)
-    number = len(np.unique(np.asarray(groups)[tables])) if groups is not None else 1
+    if groups is None:
+        return len(tables)
+    number = len(np.unique(np.asarray(groups)[tables]))
     return number if number > 1 else len(tables)
 
 
@@ -96,8 +98,8 @@ def _tail(groups: int) -> float:
     Source: the expanded percentile interval of Hesterberg, What Teachers Should Know About the Bootstrap, The American
     Statistician 69, 2015, 4.5: for a mean it is as wide as Student's.
     """
-    if groups < 2:
-        return 0.0
+    if groups == 1:
+        return TAIL  # all resamples are the same
     return float(special.ndtr(special.stdtrit(groups - 1, TAIL) * np.sqrt(groups / (groups - 1))))
 
 

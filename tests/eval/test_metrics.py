@@ -68,24 +68,30 @@ def _resampled(groups: Sequence[str], seed: int) -> list[list[int]]:
     return rows
 
 
-GROUPS = ["b", "a", "b", "c", "b", "a"]
-"""Cases of unequal size, in no order."""
-HITS, TRIALS = np.array([0.9, 0, 2.3, 0.2, 0.1, 0]), np.array([1.0, 0, 3, 1, 1, 0])
-OTHERS, TRIED = np.array([0.4, 0.8, 0.7, 0, 0, 0]), np.array([2.0, 1, 1, 0, 0, 0])
-"""Hits and trials of two methods: some resamples have no trial of one of them or of both, and some a single one."""
+GROUPS = ["b", "a", "b", "c", "b", "a", "d", "e", "f", "g", "h", "h"]
+"""Cases of unequal size, in no order; those that have a trial are six for one method, and seven for either."""
+HITS, TRIALS = (
+    np.array([0.9, 0, 2.3, 0.2, 0.1, 0, 0, 0, 0.6, 0.3, 0.7, 0.8]),
+    np.array([1.0, 0, 3, 1, 1, 0, 0, 1, 1, 1, 2, 1]),
+)
+OTHERS, TRIED = (
+    np.array([0.4, 0.8, 0.7, 0, 0, 0, 0, 0.3, 0.4, 0, 0.2, 0.1]),
+    np.array([2.0, 1, 1, 0, 0, 0, 0, 1, 1, 0, 1, 1]),
+)
+"""Hits and trials of two methods: some resamples have few trials of one of them."""
 
 
 @pytest.mark.parametrize("seed", [0, 5])
 @pytest.mark.parametrize("groups", [GROUPS, None])
 def test_resamples_are_those_of_a_loop(groups: list[str] | None, seed: int) -> None:
-    rows = _resampled(groups or list("abcdef"), seed)
-    found = metrics._resamples(6, groups, seed)
+    rows = _resampled(groups or list("abcdefghijkl"), seed)
+    found = metrics._resamples(12, groups, seed)
     assert [[i for i in row if i >= 0] for row in found.tolist()] == rows
     assert found.min() == (-1 if groups else 0)
     values = [HITS[row].sum() / TRIALS[row].sum() for row in rows if TRIALS[row].sum()]
     chosen = {"groups": groups, **({"seed": seed} if seed else {})}
     value, *ends = metrics.ratio_interval(HITS, TRIALS, **chosen)
-    tail = 100 * _tail(3 if groups else 4)
+    tail = 100 * _tail(6 if groups else 9)
     assert value == HITS.sum() / TRIALS.sum() and ends == pytest.approx(np.percentile(values, [tail, 100 - tail]))
 
 
@@ -96,7 +102,7 @@ def test_a_difference_is_that_of_a_loop(seed: int) -> None:
     options = {"seed": seed} if seed else {}
     value, *ends = metrics.ratio_difference((HITS, TRIALS), (OTHERS, TRIED), GROUPS, **options)
     assert value == pytest.approx(HITS.sum() / TRIALS.sum() - OTHERS.sum() / TRIED.sum())
-    assert ends == pytest.approx(np.percentile(values, [100 * _tail(3), 100 - 100 * _tail(3)]))
+    assert ends == pytest.approx(np.percentile(values, [100 * _tail(7), 100 - 100 * _tail(7)]))
 
 
 def _tail(groups: int) -> float:
@@ -120,6 +126,12 @@ def test_intervals_of_few_cases_hold_the_truth_nineteen_times_in_twenty() -> Non
         plain += np.percentile(values, 2.5) < 0.8 < np.percentile(values, 97.5)
     assert 0.93 < held / tries < 0.98, held / tries
     assert plain / tries < 0.93, "without the correction"
+
+
+def test_two_cases_are_two_however_often_they_are_repeated() -> None:
+    hits, ones, cases = np.tile([0.1, 0.9], 20), np.ones(40), np.repeat([0, 1], 20)
+    values = np.append(hits, 0.0)[metrics._resamples(40, cases, 0)].sum(-1) / 40
+    assert metrics.ratio_interval(hits, ones, groups=cases)[1:] == (values.min(), values.max())
 
 
 def test_all_hits_or_none_leave_room_for_the_next_table() -> None:
