@@ -126,7 +126,7 @@ def _cases(trainings: Sequence[Sequence[lockstep.Outcome]]) -> list[str]:
 def _together(trainings: Sequence[Sequence[lockstep.Outcome]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return hits and trials of each measure, by table, over all trainings."""
     each = [lockstep.counts(tables) for tables in trainings]
-    return {key: tuple(np.sum([one[key][i] for one in each], 0) for i in range(2)) for key in each[0]}  # type: ignore[misc]
+    return {key: tuple(np.sum([one[key][i] for one in each], 0) for i in range(2)) for key in each[0]}
 
 
 def _compared(theirs: Trainings, ours: Trainings) -> Iterator[tuple[str, str, float]]:
