@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from dipn_jax.eval import metrics
 from dipn_jax.eval.clearing import lockstep
-from dipn_jax.eval.report import paper
 
 from experiments import runs
 from experiments.kept_results import Kept
@@ -20,7 +19,7 @@ OURS = "dipn+gn"
 """The method that the others are compared with."""
 NO_PUSHES = "gn"
 """The method without pushes, with which those that push are compared, too."""
-MEASURES = (*paper.COLUMNS[:1], "grasps_that_held", "grasp_success_all", "efficiency_all")
+MEASURES = ("completion", "grasps_that_held", "grasp_success_all", "efficiency_all")
 """Measures of the tables."""
 PUSH_OR_NOT = ("gn", "dipn+gn+actions")
 """Methods of which the better one is chosen in hindsight."""

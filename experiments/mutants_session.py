@@ -148,6 +148,7 @@ def _prepare(
     before = files.read_json(stamp) if stamp.exists() and session.exists() else {}
     if any(before.get(key) != now[key] for key in ("module", "operators")):
         stamp.unlink(missing_ok=True)
+        session.unlink(missing_ok=True)  # Cosmic Ray does not begin a session that has results
         _python(copy, "cosmic_ray.cli", "init", str(config), str(session))
         with use_db(str(session)) as database:
             _skip(database, files.read_text(copy / module))

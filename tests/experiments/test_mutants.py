@@ -1,5 +1,6 @@
 """Mutation testing: every module has tests of its own, and the page shows what was found."""
 
+import contextlib
 import pathlib
 import sqlite3
 import subprocess
@@ -113,6 +114,24 @@ def test_only_survivors_are_run_again_when_tests_have_changed(tmp_path: pathlib.
     mutants_session._forget_survivors(tmp_path / "x.sqlite")
     with sqlite3.connect(tmp_path / "x.sqlite") as database:
         assert [row[0] for row in database.execute("SELECT job_id FROM work_results")] == ["a", "c"]
+
+
+def test_a_changed_module_begins_a_new_session(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("cosmic_ray")
+    session, module = tmp_path / "x.sqlite", tmp_path / "module.py"
+    begun: list[bool] = []
+
+    def began(*_: object) -> None:
+        begun.append(session.exists())
+        session.touch()
+
+    monkeypatch.setattr(mutants_session, "_python", began)
+    monkeypatch.setattr(mutants_session, "_skip", lambda *_: None)
+    monkeypatch.setattr("cosmic_ray.work_db.use_db", lambda _: contextlib.nullcontext())
+    for text in ("one", "one", "two"):
+        module.write_text(text)
+        mutants_session._prepare(tmp_path, tmp_path / "config", session, "module.py", [])
+    assert begun == [False, False], "once for each text, without what the other one left"
 
 
 @pytest.mark.parametrize(
