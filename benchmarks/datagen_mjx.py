@@ -144,11 +144,9 @@ def kernel(setting: Setting) -> Iterator[tuple[str, float]]:
     core = NativeEngine(engine().config, threads=1)
     plain, kernels, native = (ours(scene, poses, duration, by=by) for by in (None, engine("mjx_warp"), core))
     plain(), kernels()  # compile
-    repeats = setting.pick(5, 7)
-    theirs, mine = alternate(plain, kernels, repeats=repeats)
-    yield f"datagen_mjx.kernel/{batch}", theirs / mine
+    by_xla, mine, by_core = alternate(plain, kernels, native, repeats=setting.pick(5, 7))
+    yield f"datagen_mjx.kernel/{batch}", by_xla / mine
     yield "datagen_mjx.kernel/milliseconds", 1000 * mine / steps
-    yield "datagen_mjx.kernel/milliseconds_without", 1000 * theirs / steps
-    theirs, mine = alternate(native, kernels, repeats=repeats)
-    yield "datagen_mjx.kernel/native_core", theirs / mine
-    yield "datagen_mjx.kernel/milliseconds_native_core", 1000 * theirs / steps
+    yield "datagen_mjx.kernel/milliseconds_without", 1000 * by_xla / steps
+    yield "datagen_mjx.kernel/native_core", by_core / mine
+    yield "datagen_mjx.kernel/milliseconds_native_core", 1000 * by_core / steps

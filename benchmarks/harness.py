@@ -61,19 +61,19 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.perf_counter() - begun
 
 
-def alternate(first: Callable[[], Any], second: Callable[[], Any], *, repeats: int) -> tuple[float, float]:
-    """Return the median seconds of two pieces of work, run in turns so that both meet the same state of the machine.
+def alternate(*works: Callable[[], Any], repeats: int) -> tuple[float, ...]:
+    """Return the median seconds of pieces of work, run in turns so that all meet the same state of the machine.
 
     Args:
-      first: some work.
-      second: other work.
-      repeats: runs of each; who begins changes from pair to pair.
+      works: two pieces of work or more.
+      repeats: runs of each; who begins changes from turn to turn.
     """
-    times: tuple[list[float], list[float]] = ([], [])
+    times: list[list[float]] = [[] for _ in works]
     for repeat in range(repeats):
-        for which in (0, 1) if repeat % 2 == 0 else (1, 0):
-            times[which].append(seconds((first, second)[which]))
-    return statistics.median(times[0]), statistics.median(times[1])
+        for place in range(len(works)):
+            which = (repeat + place) % len(works)
+            times[which].append(seconds(works[which]))
+    return tuple(map(statistics.median, times))
 
 
 @contextlib.contextmanager

@@ -40,7 +40,9 @@ PADDED_SAMPLES = 12
 
 
 class MjxEngine:
-    """An `Engine` on MuJoCo MJX. Making one patches MJX in the whole process, for models of this package only.
+    """An `Engine` on MuJoCo MJX.
+
+    Making one patches MJX in the whole process, for models of this package only, unless its solver is `warp`.
 
     The patches replace MJX's constraint solver and its colliders of meshes with planes, boxes and meshes (`patches`).
     Models that were not made from our MJCF are passed on to MJX's own functions, so other code that uses MJX in the
@@ -52,12 +54,12 @@ class MjxEngine:
     def __init__(
         self, config: PhysicsConfig = DEFAULTS, *, chunk: int | None = None, devices: Sequence[jax.Device] | None = None
     ) -> None:
-        """Make an engine, and patch MJX where it steps; programs are compiled when a layout is first simulated.
+        """Make an engine, and patch MJX unless `warp` solves; programs are compiled when a layout is first simulated.
 
         Args:
           config: solver settings; the control period must be a whole number of time steps.
-          chunk: most scenes simulated at once, which bounds the memory; a power of two. If not given, 16 on a CPU (more
-            cost 1.4 times as much a scene, because all wait for the slowest), else 1024.
+          chunk: most scenes simulated at once, which bounds the memory; a power of two. If not given, 16 on a CPU (with
+            solver `xla` more cost 1.4 times as much a scene, because all wait for the slowest), else 1024.
           devices: devices that share every chunk; all local ones if not given. A power of two of them are used.
 
         Raises:

@@ -45,8 +45,10 @@ class Program:
         by_kernel = config.solver == "warp"
         self.kernel = Tick(spec, slots=slots, contacts=self.contacts, substeps=substeps) if by_kernel else None
         self.base = mjx.put_model(spec, impl="jax")
-        self.data = mjx.make_data(self.base)
         self.first_geom, self.first_body = spec.ngeom - slots * shapes.CONVEX_PARTS, spec.nbody - slots
+        if self.kernel is not None:
+            return
+        self.data = mjx.make_data(self.base)
         groups = collision_driver._geom_groups(self.base)
         self.culled = [
             np.array(pairs)[:, :2]

@@ -51,7 +51,7 @@ def capacity(slots: int, contacts: int) -> tuple[int, int]:
             return blocks, most
     blocks, most = CAPACITIES[-1]
     raise UserError(
-        f"solver warp: {slots} object slots and {contacts} contacts a scene; "
+        f"solver warp: {slots} object slots and {'all' if contacts < 0 else contacts} contacts a scene; "
         f"want at most {blocks - 1} and {most} (solver xla has no limit)"
     )
 
@@ -60,11 +60,15 @@ def check(platform: str) -> None:
     """Check that the kernel can run on a device of JAX of this kind.
 
     Raises:
-      UserError: Warp has no such devices, or it is not installed.
+      UserError: Warp has no such devices, finds none here, or is not installed.
     """
     if platform not in PLATFORMS:
         raise UserError(f"solver warp: JAX computes on {platform}; want {' or '.join(PLATFORMS)}, or solver xla")
     load()
+    import warp
+
+    if platform == "gpu" and not warp.is_cuda_available():
+        raise UserError("solver warp: Warp finds no CUDA device here; want a newer driver, or solver xla")
 
 
 def load() -> Any:
@@ -78,12 +82,13 @@ def load() -> Any:
 
         warp.config.log_level = warp.LOG_ERROR  # else it writes to stdout
         warp.init()
-        from dipn_jax.physics import tick_kernel
     except (ImportError, AttributeError, RuntimeError, OSError) as error:
         raise UserError(
             f"solver warp: {error}; want its packages (pip install 'dipn-jax[warp]') and a writable cache folder, "
             "or solver xla"
         ) from error
+    from dipn_jax.physics import tick_kernel
+
     return tick_kernel
 
 
@@ -139,9 +144,12 @@ class Tick:
           state: before it.
           control: set points of the motors.
           push: generalized forces from outside.
+
+        Raises:
+          UserError: the kernel cannot be compiled for JAX's device.
         """
         leaves = *(scene[name] for name in FIELDS), control, push, state.qpos, state.qvel, state.warmstart
-        qpos, qvel, warmstart, full, depth = self._call(*leaves)
+        qpos, qvel, warmstart, full, depth = self._call(*(leaf.astype(jnp.float32) for leaf in leaves))
         return State(qpos, qvel, warmstart, state.full | (full[0] > 0), depth[0])
 
 
@@ -152,8 +160,8 @@ def _call(kernel: Any, blocks: int, contacts: int, substeps: int, iterations: in
 
     lanes, counts = load().LANES, (blocks, contacts, substeps, iterations, tries)
     size = {"qpos_out": GRIPPER_DOF + 7 * (blocks - 1), "qvel_out": 6 * blocks, "warmstart_out": 6 * blocks}
-    # the name of the call in a program is made of this, and its number is 0 where it is traced once: the same in every
-    # process, so that XLA finds what it compiled in another
+    # the name of the call in a program is made of this, and its number is 0 where it is traced once, by the first
+    # engine with these blocks: the same in every process, so that XLA finds what it compiled in another
     kernel.func.__qualname__ = "tick_" + "_".join(map(str, counts))
     call = jax_kernel(
         kernel,
@@ -162,4 +170,13 @@ def _call(kernel: Any, blocks: int, contacts: int, substeps: int, iterations: in
         output_dims=size | {"full_out": 1, "depth_out": 1},
         block_dim=lanes,
     )
-    return jax.jit(lambda *leaves: call(*leaves, *counts))
+
+    def traced(*leaves: jax.Array) -> Any:
+        try:
+            return call(*leaves, *counts)  # Warp compiles and loads the kernel here
+        except Exception as error:
+            if type(error) is not Exception and not isinstance(error, (RuntimeError, OSError)):
+                raise
+            raise UserError(f"solver warp: {error}; want a device that Warp compiles for, or solver xla") from error
+
+    return jax.jit(traced)

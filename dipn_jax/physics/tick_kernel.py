@@ -4,6 +4,7 @@ Warp reads annotations itself, so they are no strings here, and the shape checks
 """
 
 import functools
+import threading
 import typing
 from typing import Any
 
@@ -22,7 +23,8 @@ FILES = (*cpp.SOLVER, *cpp.NARROW, "tick_motion.h", "tick_contacts.h", "tick_beg
 """C++ of a control period, but for its loop over time steps, `tick_main.h`."""
 HAND, LEFT, RIGHT = 1, 2, 3
 """Bodies of the model."""
-
+_ONE_AT_A_TIME = threading.Lock()
+"""Warp keeps functions by name until a kernel has read them, so another thread's C++ could come in between."""
 
 Numbers = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, tuple[float, ...]], ...]]
 """Numbers by name, and lists of numbers by name."""
@@ -31,7 +33,6 @@ Numbers = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, tuple[float, ...
 def numbers(m: mujoco.MjModel) -> Numbers:
     """Return what the kernel takes from a model of our MJCF, by the names in its C++: numbers, and lists of numbers."""
     contact = _rule(m, m.geom_solref[0], m.geom_solimp[0])
-    finger = m.body_invweight0[[LEFT, RIGHT], 0]
     values = {
         "STEP": m.opt.timestep,
         "GRAVITY": m.opt.gravity[2],
@@ -39,7 +40,7 @@ def numbers(m: mujoco.MjModel) -> Numbers:
         "MASS_LEFT": m.body_mass[LEFT],
         "MASS_RIGHT": m.body_mass[RIGHT],
         "INERTIA_YAW": m.body_inertia[HAND : RIGHT + 1, 2].sum() + m.dof_armature[3],
-        "FINGER_LIGHT": finger[0],
+        "FINGER_LIGHT": m.body_invweight0[LEFT, 0],
         "LINK_FRICTION": m.geom_friction[1, 0],
         "PAD_FRICTION": m.geom_friction[2, 0],
         "OBJECT_RATIO": model.OBJECT_FRICTION_RATIO,
@@ -103,12 +104,20 @@ def kernel(blocks: int, contacts: int, model_numbers: Numbers) -> Any:
       and of tries of a line search;
     - out: `qpos`, `qvel` and `warmstart` after the time steps, `full` (whether there were `most` contacts or more in
       any of them) and `depth` (metres, of the deepest contact in the last).
+
+    Threads may call it side by side.
     """
+    with _ONE_AT_A_TIME:
+        return _made(source(blocks, contacts, model_numbers, cpp.read("tick_main.h")))
+
+
+def _made(text: str) -> Any:
+    """Return the kernel whose C++ is `text`."""
     floats: Any
     integers: Any
     floats, integers = wp.array(dtype=wp.float32), wp.array(dtype=wp.int32)
 
-    @wp.func_native(source(blocks, contacts, model_numbers, cpp.read("tick_main.h")))
+    @wp.func_native(text)
     @typing.no_type_check
     def advance_scene(
         vertex: floats, face_normal: floats, radius: floats, center: floats, body_mass: floats, inertia: floats,

@@ -137,7 +137,8 @@ struct Motion : Lanes {
             for (int j = 0; j < SIX; ++j)
                 row(0, i)[j] = mass[i][j];
             const float pull = gain[i] * (given.control[i] - b.place[i]) - damping[i] * b.velocity[i];
-            b.force[i] = wp::min(wp::max(pull, least[i]), most[i]) + given.push[i] - bias[i];
+            const float held = pull < least[i] ? least[i] : pull > most[i] ? most[i] : pull;  // NaN stays
+            b.force[i] = held + given.push[i] - bias[i];
         }
         solve_hand(b.force, 0.0f, b.free);
         b.light[0] = FINGER_LIGHT;

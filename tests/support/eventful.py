@@ -9,6 +9,8 @@ SLOTS = 3
 """Object slots of a scene."""
 PERIODS = 30
 """Control periods for which the hand moves."""
+MOST = 80
+"""Contacts of a scene of at most ten objects."""
 CLASS = {name: i for i, name in enumerate(shapes.CLASSES)}
 LYING = [1.0, 0, 0, 0]
 HIGH, OPEN = ([0.1, 0, 0.3, 0, finger, finger] for finger in (0.03, 0.045))

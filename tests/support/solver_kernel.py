@@ -18,8 +18,6 @@ MOST_ROWS = 4
 """Equalities and limits that there is room for."""
 ROOM = (8, 80)
 """Blocks and contacts of a scene that there is room for."""
-BLOCK_DOFS = 6
-"""Degrees of freedom of a block."""
 
 
 @dataclasses.dataclass

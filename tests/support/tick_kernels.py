@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from eventful import MOST
 from solver_kernel import here
 
 from dipn_jax.physics import tick, tick_kernel
-
-MOST = 80
-"""Contacts of a scene."""
 
 
 def _inputs(state: Mapping[str, np.ndarray]) -> list[Any]:

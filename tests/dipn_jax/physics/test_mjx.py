@@ -40,21 +40,21 @@ LINES = (
 )
 
 FOUR_DEVICES = """
-import jax, numpy as np
+import dataclasses, sys, jax, numpy as np
 from dipn_jax.commands import console
 from dipn_jax.world import primitives, scenes
-from dipn_jax.physics.mjx import MjxEngine
+from dipn_jax.physics.mjx import DEFAULTS, MjxEngine
 from dipn_jax.physics.native import NativeEngine
 console.enable_compilation_cache()
 assert jax.device_count() == 4
 keys, config = jax.random.split(jax.random.key(0), 8), scenes.fixed_count(1)
 scene, poses = jax.tree.map(np.asarray, jax.vmap(lambda key: scenes.random_scene(key, config=config))(keys))
-many = MjxEngine()
+many = MjxEngine(dataclasses.replace(DEFAULTS, solver=sys.argv[1]))
 found, wanted = (primitives.settle(e, scene, poses, duration=0.1) for e in (many, NativeEngine(many.config)))
 np.testing.assert_allclose(found.poses[..., :3], wanted.poses[..., :3], atol=1e-3)
 np.testing.assert_array_equal(found.fault, wanted.fault)
 """
-"""A script for four virtual devices, each of which simulates two of eight falling objects."""
+"""A script for four virtual devices, each of which simulates two of eight falling objects, with the solver given."""
 
 
 @pytest.fixture(scope="session")
@@ -248,11 +248,15 @@ def test_a_fence_pushes_as_in_mujoco_c(
     assert np.abs(far - wanted.poses[:, 0])[..., 0].max() > 0.02
 
 
-def test_a_batch_is_shared_by_all_devices_and_each_scene_comes_back_in_its_place(tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize("solver", ["xla", "warp"])
+def test_a_batch_is_shared_by_all_devices_and_each_scene_comes_back_in_its_place(
+    solver: str, tmp_path: pathlib.Path
+) -> None:
     script = tmp_path / "devices.py"
     script.write_text(FOUR_DEVICES)
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, script], env=os.environ | flags, capture_output=True, text=True, check=False)
+    command, env = [sys.executable, script, solver], os.environ | flags
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import types
 from typing import Any
 
@@ -11,11 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from eventful import PERIODS, SLOTS, scenes_with_control
+from eventful import MOST, PERIODS, SLOTS, scenes_with_control
 from mujoco.mjx._src import forward, support
 
-from dipn_jax import physics
-from dipn_jax.errors import UserError
 from dipn_jax.physics import cone, mjx, patches, tick
 from dipn_jax.physics.mjx_program import Program
 from dipn_jax.physics.recording import State
@@ -24,8 +21,6 @@ from dipn_jax.world import primitives, scenes
 
 pytestmark = pytest.mark.slow
 SUBSTEPS = 4
-MOST = 80
-"""Contacts of a scene of at most ten objects."""
 STATIC_SHARED_MEMORY = 48 * 1024
 """Bytes that a CUDA kernel may have without asking at run time."""
 MOST_REGISTERS = 128
@@ -223,14 +218,17 @@ def test_on_a_gpu_nothing_is_spilled_and_its_shared_memory_is_static(
     assert 0 < used.shared <= STATIC_SHARED_MEMORY
 
 
-def test_a_call_is_the_first_of_its_name(kernel: Program, recorded: Recorded) -> None:
+def test_a_call_is_the_first_of_its_name() -> None:
     """Where it is not, another process has another program, and compiles it again."""
-    assert kernel.kernel is not None
-    scene = {name: recorded.leaves[name][0] for name in tick.FIELDS}
-    state = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), recorded.state)
-    call = jax.jit(kernel.kernel.advance).lower(scene, state, recorded.control[0], recorded.push[0])
-    text = call.as_text()
-    assert f"@tick_{SLOTS + 1}_80_{SUBSTEPS}_50_50_0(" in text and "launch_id = 0 " in text, text
+    slots, substeps = 2, 3  # as nothing else has, for a number counts the traces of all programs of one size
+    made = Program(dataclasses.replace(mjx.DEFAULTS, solver="warp"), slots, substeps)
+    assert made.kernel is not None
+    scene, poses, control = (jax.tree.map(lambda leaf: leaf[0], each) for each in scenes_with_control())
+    state = made._initial(jnp.asarray(poses[:slots]), control[0])
+    with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):  # as engines trace
+        fields = tick.scene_fields(made._fields(jax.tree.map(lambda leaf: jnp.asarray(leaf[:slots]), scene)))
+        text = jax.jit(made.kernel.advance).lower(fields, state, control[0], jnp.zeros(6 + 6 * slots)).as_text()
+    assert f"@tick_{slots + 1}_{MOST}_{substeps}_50_50_0(" in text and "launch_id = 0 " in text, text
 
 
 def test_contacts_that_are_left_out_and_what_is_not_finite_are_faults_of_their_own_scene() -> None:
@@ -248,27 +246,13 @@ def test_contacts_that_are_left_out_and_what_is_not_finite_are_faults_of_their_o
     np.testing.assert_array_equal(broken.poses[1], rollout.poses[1])
 
 
-def test_without_warp_it_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "warp", None)
-    with pytest.raises(UserError, match=r"solver warp: .*dipn-jax\[warp\].* or solver xla$") as error:
-        physics.make_engine("mjx_warp")
-    assert "\n" not in str(error.value)
+def test_a_set_point_that_is_not_finite_is_no_force(kernel: Program, recorded: Recorded) -> None:
+    import tick_kernels
 
-
-def test_what_there_is_no_kernel_for_is_refused() -> None:
-    assert [tick.capacity(*size) for size in ((7, 80), (8, 80), (14, 112))] == [(8, 80), (15, 112), (15, 112)]
-    for size in ((15, 112), (7, 113), (7, -1)):
-        with pytest.raises(UserError, match=r"object slots and .* contacts a scene; want at most 14 and 112"):
-            tick.capacity(*size)
-    size, full = np.full((1, 15, 3), 0.05, np.float32), np.full((1, 15), 0.35, np.float32)
-    crowd = Scene(np.zeros((1, 15), np.int32), size, size, full, full)
-    with pytest.raises(UserError, match="15 object slots"):
-        primitives.settle(physics.make_engine("mjx_warp"), crowd, np.zeros((1, 15, 7), np.float32), duration=0.01)
-    with pytest.raises(UserError, match="solver warp: the cone is pyramidal; want elliptic, or solver xla"):
-        Program(dataclasses.replace(mjx.DEFAULTS, solver="warp", cone="pyramidal"), 1, SUBSTEPS)
-
-
-def test_it_is_an_option_and_runs_where_warp_does() -> None:
-    assert physics.make_engine("mjx").config == mjx.DEFAULTS and mjx.DEFAULTS.solver == "xla"
-    with pytest.raises(UserError, match="solver warp: JAX computes on tpu; want cpu or gpu, or solver xla"):
-        tick.check("tpu")
+    assert kernel.kernel is not None
+    control = np.array(recorded.control)
+    control[0, 0] = np.nan
+    given = recorded.leaves | {"control": control}
+    found = tick_kernels.advance(kernel.kernel.numbers, given, substeps=SUBSTEPS, lanes=1)
+    assert np.isnan(found["qpos"][0, 0]), "else the hand is driven at full force, without a fault"
+    np.testing.assert_array_equal(found["qpos"][1:], recorded.after.qpos[1:])
