@@ -186,3 +186,24 @@ def test_luck_is_the_better_of_a_method_and_itself(tmp_path: pathlib.Path) -> No
     values = clearing_numbers.numbers(*_kept(tmp_path, rows))
     assert values["hindsight/luck/grasps"] == 5 + 5 + 6 + 5 and "hindsight/heldout/grasps" not in values
     assert "itself with 2 mm of noise, in hindsight | 4 |" in clearing_tables.of_methods(values, "heldout", "all")
+
+
+def test_ends_are_counted_by_their_reason() -> None:
+    ended = ["cleared", "pushed out", "pushed out", "fault"]
+    tables = [lockstep.Outcome(str(i), why, 5, 4, 4, 6, 1) for i, why in enumerate(ended)]
+    values = clearing_numbers._measured({"0": tables})
+    found = {key: values[f"ended_{key}"] for key in ("pushed_out", "out_of_actions", "fault")}
+    assert found == {"pushed_out": 2, "out_of_actions": 0, "fault": 1}
+    assert values["completion"] == 0.25 and values["grasp_success_completed"] == 4 / 6
+    nothing = clearing_numbers._measured({"0": tables[1:]})
+    assert nothing["grasp_success_completed"] is None, "no table was cleared"
+
+
+def test_of_two_tables_as_empty_the_one_with_fewer_actions_is_better() -> None:
+    def one(removed: int, grasps: int, pushes: int) -> lockstep.Outcome:
+        return lockstep.Outcome("01", "cleared", 5, removed, removed, grasps, pushes)
+
+    pushed, alone = [one(5, 5, 2), one(5, 5, 0), one(4, 4, 0)], [one(5, 6, 0), one(5, 5, 1), one(5, 9, 0)]
+    groups = {"table/hard/shipped/all/gn": {"0": alone}, "table/hard/shipped/all/dipn+gn+actions": {"0": pushed}}
+    (better,) = clearing_numbers._hindsight(groups)["hindsight/hard"].values()
+    assert better == [alone[0], pushed[1], alone[2]]
