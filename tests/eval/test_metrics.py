@@ -128,6 +128,12 @@ def test_intervals_of_few_cases_hold_the_truth_nineteen_times_in_twenty() -> Non
     assert plain / tries < 0.93, "without the correction"
 
 
+def test_resamples_without_a_trial_are_left_out() -> None:
+    few, all_of_them = np.array([1.0, 0.0, 0.0]), np.ones(3)
+    for ours, theirs in (((few, few), (all_of_them / 2, all_of_them)), ((all_of_them / 2, all_of_them), (few, few))):
+        assert np.isfinite(metrics.ratio_difference(ours, theirs, ["a", "b", "c"])).all()
+
+
 def test_two_cases_are_two_however_often_they_are_repeated() -> None:
     hits, ones, cases = np.tile([0.1, 0.9], 20), np.ones(40), np.repeat([0, 1], 20)
     values = np.append(hits, 0.0)[metrics._resamples(40, cases, 0)].sum(-1) / 40
