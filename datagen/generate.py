@@ -122,10 +122,10 @@ def _maker(job: Job, engine: Engine, scorer: Scorer | None) -> Callable[..., epi
     """Return the function that makes a batch of episodes of `job` with `engine`: (key, *, count)."""
     guide = episodes.Guide(scorer, job.guided, job.unsure) if scorer else None
     queued = engine.on_device() if isinstance(engine, DeviceEngine) and job.kind != "images" else None
-    rooms = on_device if queued else episodes
+    module = on_device if queued else episodes
     makers: dict[str, Callable[..., episodes.Batch]] = {
-        "push": functools.partial(rooms.push_batch, actions=job.actions, distances=job.distances),
-        "grasp": functools.partial(rooms.grasp_batch, actions=job.actions, guide=guide),
+        "push": functools.partial(module.push_batch, actions=job.actions, distances=job.distances),
+        "grasp": functools.partial(module.grasp_batch, actions=job.actions, guide=guide),
         "images": episodes.image_batch,
     }
     return functools.partial(makers[job.kind], engine=queued or engine, config=job.scene)

@@ -88,7 +88,7 @@ class DeviceEngine(Engine, Protocol):
     def on_device(self) -> Engine | None:
         """Return this engine for arrays that stay on its device: `simulate` does not wait, and can be traced.
 
-        None if it has several devices, between which rows would travel.
+        None if it has several devices, between which rows would travel, or a CPU, where nothing is gained.
         """
         ...
 

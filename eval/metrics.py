@@ -24,7 +24,7 @@ def ratio_interval(
 
     Few groups vary less in their resamples than they do, so the interval ends at more extreme resamples the fewer they
     are (`_tail`). Where all trials hit, or none, resamples do not vary: then it is the binomial interval of as many
-    trials as there are groups (Clopper and Pearson, Biometrika 26, 1934).
+    trials as there are groups, or tables of the only group (Clopper and Pearson, Biometrika 26, 1934).
 
     Args:
       hits: `[I]` per table.
@@ -78,7 +78,7 @@ def ratio_difference(
 
 
 def _groups(trials: np.ndarray, groups: Sequence[Any] | None) -> int:
-    """Return the number of groups that have a trial; where there is one, the number of its tables with a trial."""
+    """Return the number of groups that have a trial; of one group, the number of its tables with a trial."""
     tables = np.flatnonzero(trials)
     if groups is None:
         return len(tables)

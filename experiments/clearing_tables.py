@@ -38,16 +38,16 @@ def _difference(values: dict[str, Any], at: str) -> str:
     if values.get(at) is None:
         return ""
     value, low, high = (100 * values[f"{at}{end}"] for end in ("", "_low", "_high"))
-    sure = "**" if low > 0 or high < 0 else ""
+    sure = "**" if (low > 0 or high < 0) and low < high else ""
     value, low, high = (round(number, 1) + 0.0 for number in (value, low, high))  # no -0.0
     return f"{sure}{value:+.1f}{sure} [{low:+.1f}, {high:+.1f}]"
 
 
 def multiplicity(values: dict[str, Any]) -> str:
     """Return a sentence with the number of differences on the page, and of those whose interval excludes zero."""
-    ends = [f"efficiency_all_{end}" for end in ("difference", "over_gn")]
-    shown = [key for key in values if key.endswith(tuple(ends))]
-    sure = sum(values[f"{key}_low"] > 0 or values[f"{key}_high"] < 0 for key in shown)
+    shown = [key for key in values if key.endswith(("efficiency_all_difference", "efficiency_all_over_gn"))]
+    ends = [(values[f"{key}_low"], values[f"{key}_high"]) for key in shown]
+    sure = sum(low < high and not low <= 0 <= high for low, high in ends)
     said = (
         f"The tables below show {len(shown)} differences, each with an interval of its own; {sure} of these exclude "
         f"zero (bold), and about {max(1, round(len(shown) / 20))} would by chance if no method differed from another."

@@ -98,7 +98,8 @@ class MjxEngine:
 
     def on_device(self) -> OnDevice | None:
         """See `DeviceEngine.on_device`; it shares programs, and `stop`, with this one."""
-        return OnDevice(self) if len(self.devices) == 1 else None
+        alone = len(self.devices) == 1 and self.devices[0].platform != "cpu"
+        return OnDevice(self) if alone else None
 
     def _simulate(
         self,

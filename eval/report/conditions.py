@@ -48,19 +48,19 @@ class Conditions:
 
 def read(settings: Mapping[str, Any]) -> Conditions:
     """Return the conditions that `settings.json` records: options on which the tables do not depend are left out."""
-    seed = {"--seed": _text(settings.get("seed"))}
+    seed, engine = {"--seed": _text(settings.get("seed"))}, {"--engine": _text(settings.get("engine"))}
     count = {"--instances": _text(settings.get("tables.instances"))}
     if settings["tables.cases"] == "random":
         ranges = settings.get("tables.ranges", {})
         tables = {"--objects": _text(settings["tables.objects"])} | count | seed
-        tables |= {_option(name): _text(ranges.get(name)) for name in dataclasses.asdict(DEFAULT_RANGES)}
+        tables |= {_option(name): _text(ranges.get(name)) for name in dataclasses.asdict(DEFAULT_RANGES)} | engine
     else:
         digests = [digest[:DIGITS] for digest in settings.get("files", {}).values()]
         tables = {CASE_FILE: " ".join(digests) or NOT_RECORDED}
         tables |= {_option(name): _text(settings.get(f"tables.{name}")) for name in ("names", "as_placed")}
         tables |= count | seed
     seen = {_option(name): _text(settings.get(f"camera.{name}")) for name in dataclasses.asdict(DEFAULT_CAMERA)}
-    return Conditions(tables, seen | {"--engine": _text(settings.get("engine"))})
+    return Conditions(tables, seen if engine.items() <= tables.items() else seen | engine)
 
 
 def _option(name: str) -> str:

@@ -25,8 +25,8 @@ DIFFERENCE = f"{COMPARED}_difference"
 ENDS = ("", "_low", "_high")
 """Ends of the names of a metric and of its interval."""
 NOTE = (
-    "Per cent, with bootstrap 95 % intervals over cases, then over their repeats (random tables: over tables); the "
-    "numbers of the paper are of its own simulator, robot and objects."
+    "Per cent, with 95 % intervals over cases, then over their repeats (random tables: over tables): of a bootstrap, "
+    "or the binomial's where nothing failed. The numbers of the paper are of its own simulator, robot and objects."
 )
 """What is said below the tables of results."""
 Difference = tuple[float, float, float]
@@ -104,7 +104,7 @@ class Results:
         found = conditions.notes({one.name: one.conditions for one in self.rows})
         if self.rival is not None and self.differences:
             found.append(
-                f"Points from {self.rival.name}: objects per action less those of {self.rival.name}, in percentage "
+                f"Points from {self.rival.name}: objects per action minus those of {self.rival.name}, in percentage "
                 "points, paired by table, with a 95 % interval; ahead and behind stand where it excludes zero."
             )
             if unpaired := [name for name, difference in self.differences.items() if difference is None]:
@@ -176,4 +176,4 @@ def _told(difference: Difference | None) -> str:
         return "-"
     value, low, high = (100 * part for part in difference)
     interval = f" [{low:+.1f}, {high:+.1f}]" if np.isfinite(low) else ""
-    return f"{value:+.1f}{interval}{' ahead' if low > 0 else ' behind' if high < 0 else ''}"
+    return f"{value:+.1f}{interval}{'' if low == high else ' ahead' if low > 0 else ' behind' if high < 0 else ''}"

@@ -177,8 +177,9 @@ def test_methods_with_pushes_are_compared_with_grasping_alone_too(tmp_path: path
     assert values["table/hard/paper/all/vpg/efficiency_all_over_gn"] == 20 / 80 - 20 / 40
     assert "table/hard/paper/all/gn/efficiency_all_over_gn" not in values
     text = clearing_tables.of_methods(values, "hard", "all")
-    assert "| more than GN alone |" in text.splitlines()[0] and "| **-25.0** [-25.0, -25.0] |" in text
-    assert "show 3 differences, each with an interval of its own; 2 of these" in clearing_tables.multiplicity(values)
+    assert "| more than GN alone |" in text.splitlines()[0]
+    assert "| -25.0 [-25.0, -25.0] |" in text, "an interval without width is not sure"
+    assert "show 3 differences, each with an interval of its own; 1 of these" in clearing_tables.multiplicity(values)
 
 
 def test_luck_is_the_better_of_a_method_and_itself(tmp_path: pathlib.Path) -> None:

@@ -1,10 +1,13 @@
 """The lists of runs: every command is accepted by its own parser."""
 
+import itertools
 import pathlib
 from types import ModuleType
+from typing import get_args
 
 import pytest
 
+from dipn_jax.names import MethodName
 from experiments import clearing, demo, grasping, push_prediction, runs
 
 EXPERIMENTS = (demo, push_prediction, grasping, clearing)
@@ -22,8 +25,8 @@ def test_a_dry_run_parses_every_command_and_writes_nothing(
     if experiment is clearing:  # as if nothing was kept of it
         monkeypatch.setattr(clearing, "KEPT", tmp_path / "none.json")
     assert experiment.main(["--dry-run", "--out", str(tmp_path / "out")]) == 0
-    said = capfd.readouterr()
-    assert said.out.count("\n") == len(experiment.list_runs(tmp_path / "out")) and not said.err
+    said, listed = capfd.readouterr(), experiment.list_runs(tmp_path / "out")
+    assert said.out.count("\n") == len(listed) > 10 and not said.err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -49,6 +52,14 @@ def test_runs_are_listed_and_an_unknown_name_is_refused(
     assert capfd.readouterr().out.count("\n  dipn-") == len(experiment.list_runs(tmp_path))
     assert experiment.main(["--only", "nothing"]) == 2
     assert capfd.readouterr().err.count("\n") == 1
+
+
+def test_every_training_of_every_budget_clears_with_every_method() -> None:
+    names = {run.name for run in clearing.list_runs(pathlib.Path("results"))}
+    methods = set(get_args(MethodName)) - {"physics+gn"}
+    for budget, (_, trainings, _) in clearing.BUDGETS.items():
+        for seed, on, aids, method in itertools.product(range(trainings), ("hard", "heldout"), clearing.AIDS, methods):
+            assert f"table/{on}/{budget}/{aids}/{method}/{seed}" in names
 
 
 def test_the_recipes_that_figures_were_made_with() -> None:

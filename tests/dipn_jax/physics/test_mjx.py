@@ -17,7 +17,7 @@ from object_sizes import SIZES
 
 from dipn_jax.errors import UserError
 from dipn_jax.physics import mjx, mjx_program
-from dipn_jax.physics.mjx import MjxEngine
+from dipn_jax.physics.mjx import MjxEngine, OnDevice
 from dipn_jax.physics.native import NativeEngine
 from dipn_jax.structs import ABSENT, Fault, Grasp, Push, Scene, Trajectory
 from dipn_jax.workspace import GRIPPER
@@ -227,8 +227,8 @@ def test_on_its_device_it_returns_the_same_arrays_and_can_be_traced(
     engine: MjxEngine, settled: tuple[Scene, np.ndarray]
 ) -> None:
     scene, poses = jax.tree.map(jnp.asarray, settled)
-    queued = engine.on_device()
-    assert queued is not None
+    queued = OnDevice(engine)
+    assert engine.on_device() is None, "a CPU"
     found = primitives.settle(queued, scene, poses, duration=0.05)
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(found))
     wanted = primitives.settle(engine, *settled, duration=0.05)

@@ -39,7 +39,7 @@ def test_rows_of_equal_tables_are_said_to_be_made_with_their_options() -> None:
     ]
     packed = _read(Tables("random", instances=3, ranges=Ranges(packed=1.0)))
     assert conditions.notes({"gn": packed}) == [
-        "All rows: --objects 10, --instances 3, --seed 1000000, --packed 1, --masks found, --engine auto."
+        "All rows: --objects 10, --instances 3, --seed 1000000, --packed 1, --engine auto, --masks found."
     ]
 
 
@@ -114,3 +114,8 @@ def test_damaged_settings_are_one_line(tmp_path: pathlib.Path) -> None:
     files.write_json(tmp_path / "settings.json", settings | {"seed": "x"})
     with pytest.raises(UserError, match=r"settings\.json: damaged, seed is x"):
         cleared.Cleared(tmp_path)
+
+
+def test_random_tables_of_another_engine_lie_otherwise() -> None:
+    assert not _read(Tables("random")).same_tables(_read(Tables("random"), engine="mjx"))
+    assert _read(Tables("hard")).same_tables(_read(Tables("hard"), engine="mjx")), "the same cases"
