@@ -87,13 +87,23 @@ def _first_unsure(table: Instance) -> int | None:
 
 
 def _at(table: Instance, step: int) -> Instance:
-    """Return a table as it was before an action."""
+    """Return a table as it was before an action, with the actions that it had taken, which count."""
     before = table.film[step]
     scene = table.scene.replace(shape=before["shape"])
     height, memory = render.render(scene, before["poses"]).height, MissedGrasps()
     for grasp in before["missed"][before["missed"][:, 0] >= 0]:
         memory = memory.add(grasp, height)
-    return Instance(table.name, scene, before["poses"].copy(), int((before["shape"] >= 0).sum()), missed=memory)
+    left = int((before["shape"] >= 0).sum())
+    return Instance(
+        table.name,
+        scene,
+        before["poses"].copy(),
+        table.objects,
+        table.number,
+        grasps=step,
+        removed=table.objects - left,
+        missed=memory,
+    )
 
 
 def _shortfalls(states: Sequence[tuple[Instance, int]]) -> list[float]:
@@ -119,7 +129,7 @@ def _row(table: Instance, step: int, pushed: Instance, lack: float) -> dict[str,
         "shortfall": lack,
         "pushed": pushed.did[0] == "push",
         "grasps_alone": len(table.did) - step,
-        "push_first": pushed.actions,
+        "push_first": pushed.actions - step,
         "cleared": [table.ended == "cleared", pushed.ended == "cleared"],
     }
 
@@ -130,20 +140,31 @@ LIMITS = (0.0, 1.0, 1.5, 2.0, 2.2, 2.4, 2.6, 3.0)
 
 def table(states: dict[str, Any]) -> str:
     """Return a table of what pushes save in all, by the shortfall or the rise of the mean from which they are made."""
-    rows, lines = {name: states[name] for name in KINDS}, []
+    rows = {name: states[name] for name in KINDS}
+    lines = [["states", *map(_about, rows.values())]]
     for limit in LIMITS:
         cells = [_saved([row for row in found if row["shortfall"] > limit]) for found in rows.values()]
         lines.append([f"shortfall over {limit:.1f}", *cells])
     for ratio in (1 / 0.9, 2.0, 3.0, 4.0):
         cells = [_saved([row for row in found if (row["mean_ratio"] or 0) > ratio]) for found in rows.values()]
         lines.append([f"mean score rises by a factor over {ratio:.2f}", *cells])
-    return markdown.table(["pushed where", *(f"{name}: pushes, actions saved" for name in rows)], lines)
+    return markdown.table(["pushed where", *(f"{name}: pushes; saved; only with, only without" for name in rows)], lines)
 
 
 def _saved(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the number of pushes, and how many actions fewer all took with them than without."""
-    made = [row for row in rows if row["pushed"] and all(row["cleared"])]
-    return f"{len(made)}, {sum(row['grasps_alone'] - row['push_first'] for row in made):+d}"
+    """Return the number of pushes, actions saved where both ways cleared, and tables that one way alone cleared."""
+    made = [row for row in rows if row["pushed"]]
+    saved = sum(row["grasps_alone"] - row["push_first"] for row in made if all(row["cleared"]))
+    alone, pushed = (sum(row["cleared"] == way for row in made) for way in ([True, False], [False, True]))
+    return f"{len(made)}; {saved:+d}; {pushed}, {alone}"
+
+
+def _about(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the number of states, of cases, of single objects, and of tables that were cleared in both ways."""
+    cases = len({row["case"] for row in rows})
+    single = sum(row["objects"] == 1 for row in rows)
+    both, neither = (sum(row["cleared"] == [way, way] for row in rows) for way in (True, False))
+    return f"{len(rows)} of {cases} cases, {single} with a single object; both ways cleared {both}, neither {neither}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

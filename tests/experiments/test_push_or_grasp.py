@@ -18,13 +18,17 @@ ROW: dict[str, Any] = {
 
 def test_what_pushes_save_is_counted_where_they_would_be_made() -> None:
     worse = ROW | {"shortfall": 1.2, "mean_ratio": 1.05, "push_first": 8}
-    others = [ROW | {"pushed": False}, ROW | {"cleared": [True, False]}, ROW | {"mean_ratio": None}]
+    others = [ROW | {"pushed": False}, ROW | {"mean_ratio": None}]
+    others += [ROW | {"cleared": ways} for ways in ([True, False], [False, True])]
+    others += [ROW | {"cleared": [False, False], "objects": 1, "case": "02", "pushed": False}]
     lines = push_or_grasp.table({"hard": [ROW, worse, *others], "packed": [worse]}).splitlines()
-    assert lines[0] == "| pushed where | hard: pushes, actions saved | packed: pushes, actions saved |"
-    found = {line.split(" | ")[0][2:]: line.split(" | ")[1:] for line in lines[2:]}
-    assert found["shortfall over 0.0"] == ["3, +3", "1, -1 |"]
-    assert found["shortfall over 2.2"] == ["2, +4", "0, +0 |"] and found["shortfall over 2.4"] == ["0, +0", "0, +0 |"]
-    assert found["mean score rises by a factor over 2.00"] == ["1, +2", "0, +0 |"]
+    assert lines[0].startswith("| pushed where | hard: pushes; saved; only with, only without | packed: ")
+    found = {line.split(" | ")[0][2:]: line.split(" | ")[1:] for line in lines[2:] if line.startswith("|")}
+    assert found["shortfall over 0.0"] == ["5; +3; 1, 1", "1; -1; 0, 0 |"]
+    assert found["shortfall over 2.2"] == ["4; +4; 1, 1", "0; +0; 0, 0 |"]
+    assert found["shortfall over 2.4"] == ["0; +0; 0, 0", "0; +0; 0, 0 |"]
+    assert found["mean score rises by a factor over 2.00"] == ["3; +2; 1, 1", "0; +0; 0, 0 |"]
+    assert found["states"][0] == "7 of 2 cases, 1 with a single object; both ways cleared 4, neither 1"
 
 
 def test_the_first_unsure_state_is_where_both_ways_begin(settled: Any) -> None:
@@ -34,11 +38,13 @@ def test_the_first_unsure_state_is_where_both_ways_begin(settled: Any) -> None:
         misses[:missed] = 7
         return {"values": np.array([score, 0, 0]), "shape": shape, "poses": settled.poses[0] + left, "missed": misses}
 
-    table = Instance("one", structs.take(settled.scene, 0), settled.poses[0], 5)
+    table = Instance("one", structs.take(settled.scene, 0), settled.poses[0], 5, number=11)
     table.film = [step(0.9, 5, 0), step(0.71, 4, 1), step(0.7, 3, 2), step(0.1, 2, 0)]
     assert push_or_grasp._first_unsure(table) == 2
     begun = push_or_grasp._at(table, 2)
-    assert begun.objects == 3 and len(begun.missed.grasps) == 2 and begun.actions == 0
+    assert len(begun.missed.grasps) == 2 and begun.removed == 2
+    assert (begun.objects, begun.actions) == (5, 2), "both ways end after as many actions"
+    assert begun.number == table.number != 0, "both ways draw with the same keys"
     np.testing.assert_array_equal(begun.poses, settled.poses[0] + 3)
     table.film = table.film[:2]
     assert push_or_grasp._first_unsure(table) is None
