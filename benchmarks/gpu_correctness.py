@@ -103,7 +103,7 @@ def agreement_mjx(size: Size) -> Found:
 
 
 def agreement_mjx_warp(size: Size) -> Found:
-    """Measure MJX with the Warp kernel in the place of its time steps against MuJoCo C; see `_agreement`."""
+    """Measure `mjx_warp`, whose time steps a Warp kernel computes, against MuJoCo C; see `_agreement`."""
     yield from _agreement("mjx_warp", size)
 
 

@@ -1,4 +1,4 @@
-"""Batches of episodes from a random key, for an engine whose arrays stay on its devices.
+"""Batches of episodes from a random key, for an engine whose arrays stay on its device.
 
 They are those of `episodes`. Nothing waits for the host between the drop and the last pose: scenes that fell badly are
 sorted to the end, as are pushes that are not feasible, and their places are filled up with others, which are not kept.
@@ -33,7 +33,7 @@ def push_batch(
     actions: int,
     distances: tuple[float, ...] = (PUSH_STEPS * 0.01,),
 ) -> Batch:
-    """Return the pushes of `episodes.push_batch`, made on the devices of `engine`, which returns arrays there."""
+    """Return the pushes of `episodes.push_batch`, made on the device of `engine`, which returns arrays there."""
     queued = push_episodes(key, engine, config, count=count, actions=actions, distances=distances)
     made, kept, infeasible, fault = jax.device_get(queued)
     counts = clutter.drop_counts(fault) | {"infeasible_pushes": int(infeasible)}
@@ -49,7 +49,7 @@ def grasp_batch(
     actions: int,
     guide: Guide | None = None,
 ) -> Batch:
-    """Return the grasps of `episodes.grasp_batch`, made on the devices of `engine`, which returns arrays there."""
+    """Return the grasps of `episodes.grasp_batch`, made on the device of `engine`, which returns arrays there."""
     queued = grasp_episodes(key, engine, config, count=count, actions=actions, guide=guide)
     made, kept, fault = jax.device_get(queued)
     return _first(made, int(kept), clutter.drop_counts(fault))

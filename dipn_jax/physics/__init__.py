@@ -1,6 +1,6 @@
 """One interface, four engines: `native` (MuJoCo C on CPU threads), `mjx` (XLA: GPU, TPU, CPU), `mjx_warp`, `warp`.
 
-`mjx_warp` is `mjx` with the kernel of `tick` in the place of MJX; `warp` is MuJoCo Warp, for NVIDIA GPUs.
+In `mjx_warp` the kernel of `tick` computes the time steps of `mjx`; `warp` is MuJoCo Warp, for NVIDIA GPUs.
 
 All read the same MJCF (`dipn_jax.world.model`), take the same arguments and return the same result, so which
 one runs is a configuration value.

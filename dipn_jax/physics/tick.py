@@ -121,7 +121,7 @@ class Tick:
           substeps: time steps of a control period.
 
         Raises:
-          UserError: there is no kernel for so many or for another cone than the elliptic one, or Warp is not installed.
+          UserError: more slots or contacts than a kernel has room for, a cone that is not elliptic, or no Warp.
         """
         if spec.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
             raise UserError("solver warp: the cone is pyramidal; want elliptic, or solver xla")

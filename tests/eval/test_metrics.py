@@ -106,8 +106,8 @@ def test_a_difference_is_that_of_a_loop(seed: int) -> None:
 
 
 def _tail(groups: int) -> float:
-    """Return the share left out on each side: Student's quantile for so many groups, for their maximum-likelihood
-    variance, as a share of the normal distribution.
+    """Return the share left out on each side: that of the normal distribution beyond Student's quantile, which is
+    widened because the variance of resamples is (n - 1) / n of that of a sample.
     """
     wide = stats.t.isf(0.025, groups - 1) * np.sqrt(groups / (groups - 1))
     return float(stats.norm.sf(wide))

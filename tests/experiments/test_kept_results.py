@@ -186,6 +186,7 @@ def test_luck_is_the_better_of_a_method_and_itself(tmp_path: pathlib.Path) -> No
     rows = {"table/heldout/shipped/all/dipn+gn/0": [5, 9, 6, 7], "noise/height-2mm": [8, 5, 6, 5]}
     values = clearing_numbers.numbers(*_kept(tmp_path, rows))
     assert values["hindsight/luck/grasps"] == 5 + 5 + 6 + 5 and "hindsight/heldout/grasps" not in values
+    assert "hindsight/luck/efficiency_all_difference" not in values, "what is chosen is compared with nothing"
     assert "itself with 2 mm of noise, in hindsight | 4 |" in clearing_tables.of_methods(values, "heldout", "all")
 
 

@@ -149,3 +149,9 @@ def test_a_comparison_with_nothing_is_one_line(
     assert console.run("test", cli.COMMANDS, ["report", *words, "--out", str(tmp_path / "out")]) == 2
     assert capfd.readouterr().err == f"error: {says}\n"
     assert not (tmp_path / "out").exists()
+
+
+def test_a_difference_is_ahead_or_behind_only_where_its_interval_has_a_width_and_excludes_zero() -> None:
+    told = {(0.1, 0.02, 0.2): "ahead", (-0.1, -0.2, -0.02): "behind", (0.1, -0.1, 0.2): "", (0.1, 0.1, 0.1): ""}
+    for difference, word in told.items():
+        assert results._told(difference).rpartition("]")[2].strip() == word
